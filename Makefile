@@ -1,0 +1,49 @@
+# Everything a newcomer or CI needs. `make help` lists the targets.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+EXTRAS := dev,mlflow,wandb,tensorboard
+# Two cores learn as fast as one on small networks, but two test workers halve the waiting.
+WORKERS ?= 2
+
+.DEFAULT_GOAL := help
+.PHONY: help setup check format test test-slow demo mlflow clean-venv
+
+help:  ## list the targets
+	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
+
+$(VENV)/.installed: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
+	  { echo "Scilab-RL needs Python 3.10 or newer; found $$($(PYTHON) --version). Try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
+	@touch $@
+
+setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
+	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
+
+demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 4 minutes)
+	$(BIN)/python src/main.py algorithm=sac env=FetchReach-v4 seed=1
+	$(BIN)/python src/main.py play last --episodes 20 --record
+
+check: $(VENV)/.installed  ## format, lint, types and import layers, as CI runs them
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+format: $(VENV)/.installed  ## rewrite the code in the project's format
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+test: $(VENV)/.installed  ## the fast tests
+	$(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
+
+test-slow: $(VENV)/.installed  ## the slow and the performance tests (an hour)
+	$(BIN)/python -m pytest -m "slow or performance"
+
+mlflow: $(VENV)/.installed  ## browse the recorded runs on http://127.0.0.1:5000
+	$(BIN)/mlflow ui --host 127.0.0.1 --port 5000 --backend-store-uri sqlite:///data/mlflow.db
+
+clean-venv:  ## remove .venv (nothing else)
+	rm -rf $(VENV)

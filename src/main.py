@@ -1,0 +1,5 @@
+"""The entry point of the paper: ``python src/main.py algorithm=sac env=FetchReach-v4``."""
+
+from scilab_rl.cli import main
+
+main()

@@ -1,0 +1,111 @@
+"""Checking the keyword arguments of an algorithm before anything is built."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any
+
+from scilab_rl.errors import ConfigError, did_you_mean, listing
+
+# Given by the framework, never by the user's YAML.
+FRAMEWORK_PARAMETERS = ("policy", "env", "seed", "device", "verbose", "tensorboard_log")
+_HIDDEN = ("self", "_init_setup_model", "env", "seed", "device", "verbose", "tensorboard_log")
+
+_FRACTION = (0.0, 1.0)
+_POSITIVE = (math.ulp(0.0), math.inf)
+_AT_LEAST_1 = (1, math.inf)
+_AT_LEAST_0 = (0, math.inf)
+# Parameters whose meaning is the same in all algorithms of the field, and their range.
+RANGES: dict[str, tuple[float, float]] = {
+    "gamma": _FRACTION,
+    "tau": _FRACTION,
+    "gae_lambda": _FRACTION,
+    "exploration_fraction": _FRACTION,
+    "exploration_initial_eps": _FRACTION,
+    "exploration_final_eps": _FRACTION,
+    "weight_critic_var": _FRACTION,
+    "learning_rate": _POSITIVE,
+    "batch_size": _AT_LEAST_1,
+    "buffer_size": _AT_LEAST_1,
+    "n_critics": _AT_LEAST_1,
+    "n_steps": _AT_LEAST_1,
+    "n_epochs": _AT_LEAST_1,
+    "policy_delay": _AT_LEAST_1,
+    "target_update_interval": _AT_LEAST_1,
+    "learning_starts": _AT_LEAST_0,
+    "max_grad_norm": _POSITIVE,
+    "clip_range": _POSITIVE,
+}
+
+
+def allowed_arguments(cls: Callable[..., Any]) -> list[str]:
+    """Return the keyword arguments that a user may set, in the constructor's order."""
+    return [name for name in _parameters(cls) if name not in _HIDDEN]
+
+
+def accepts(cls: Callable[..., Any], name: str) -> bool:
+    """Tell whether the constructor has a parameter of this name."""
+    return name in _parameters(cls)
+
+
+def check_arguments(name: str, cls: Callable[..., Any], arguments: Mapping[str, Any]) -> None:
+    """Refuse unknown arguments and values outside their range.
+
+    Args:
+        name: The algorithm's name, for the message.
+        cls: Its class.
+        arguments: What the configuration gives.
+
+    Raises:
+        ConfigError: With the allowed names or the allowed range.
+    """
+    allowed = allowed_arguments(cls)
+    for argument, value in arguments.items():
+        if argument not in allowed:
+            raise ConfigError(
+                f"The algorithm '{name}' has no parameter algorithm.{argument}."
+                f"{did_you_mean(argument, allowed)} It has: {listing(allowed, limit=40)}."
+            )
+        _check_range(argument, value)
+        _check_type(argument, value, cls)
+
+
+def _parameters(cls: Callable[..., Any]) -> Iterable[str]:
+    signature = inspect.signature(cls)
+    return [
+        p.name for p in signature.parameters.values() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+    ]
+
+
+def _check_range(argument: str, value: Any) -> None:
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return
+    low, high = RANGES.get(argument, (-math.inf, math.inf))
+    if math.isnan(value) or not low <= value <= high:
+        if (low, high) == _POSITIVE:
+            wanted = "greater than 0"
+        elif high == math.inf:
+            wanted = f"at least {low:g}" if low > -math.inf else "a number"
+        else:
+            wanted = f"from {low:g} to {high:g}"
+        raise ConfigError(f"algorithm.{argument} must be {wanted}, but it is {value}.")
+
+
+def _check_type(argument: str, value: Any, cls: Callable[..., Any]) -> None:
+    """Compare with the type of the default: a number cannot be replaced by a word.
+
+    Words that a parameter understands (``auto``, ``auto_0.1``, ``lin_3e-4``) are left to the algorithm
+    when its annotation allows text.
+    """
+    parameter = inspect.signature(cls).parameters[argument]
+    default, annotation = parameter.default, str(parameter.annotation)
+    is_number = isinstance(default, (int, float)) and not isinstance(default, bool)
+    if is_number and isinstance(value, (str, list)) and "str" not in annotation and "tuple" not in annotation:
+        raise ConfigError(f"algorithm.{argument} must be a number, but it is {value!r}.")
+    if isinstance(default, bool) and not isinstance(value, bool) and value not in (0, 1):
+        raise ConfigError(f"algorithm.{argument} must be true or false, but it is {value!r}.")
+    whole = isinstance(default, int) and is_number and "float" not in annotation
+    if whole and isinstance(value, float) and not value.is_integer():
+        raise ConfigError(f"algorithm.{argument} must be a whole number, but it is {value}.")

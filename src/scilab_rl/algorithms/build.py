@@ -1,0 +1,107 @@
+"""From an algorithm's configuration to an object that can learn."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.vec_env import VecEnv
+
+from scilab_rl.algorithms.arguments import accepts
+from scilab_rl.algorithms.compatibility import is_goal_space, is_image_space
+from scilab_rl.errors import ConfigError
+
+_log = logging.getLogger(__name__)
+
+
+def build_algorithm(
+    cls: Callable[..., Any],
+    arguments: Mapping[str, Any],
+    env: VecEnv,
+    *,
+    seed: int,
+    device: str,
+) -> Any:
+    """Build an algorithm with what follows from the environment filled in.
+
+    ``policy: auto`` becomes the policy class for the observations, ``replay_buffer_class: auto``
+    hindsight experience replay for goal environments, and a scalar action noise gets the shape of
+    the actions.
+
+    Args:
+        cls: The class that ``_target_`` names.
+        arguments: Its keyword arguments from the configuration.
+        env: Training environments.
+        seed: Seed of the run.
+        device: ``auto``, ``cpu``, ``cuda``, ...
+
+    Raises:
+        ConfigError: If hindsight replay cannot work with this environment, or the constructor
+            refuses the arguments.
+    """
+    arguments = dict(arguments)
+    if accepts(cls, "policy") and arguments.get("policy", "auto") == "auto":
+        arguments["policy"] = policy_name(env)
+    if "replay_buffer_class" in arguments:
+        _choose_replay_buffer(arguments, env)
+    if isinstance(noise := arguments.get("action_noise"), NormalActionNoise):
+        arguments["action_noise"] = _shaped_noise(noise, env)
+    given = {"env": env, "seed": seed, "device": device}
+    arguments |= {name: value for name, value in given.items() if accepts(cls, name)}
+    try:
+        return cls(**arguments)
+    except (AssertionError, TypeError, ValueError) as error:
+        raise ConfigError(f"{getattr(cls, '__name__', cls)} refuses its arguments: {error}") from error
+
+
+def policy_name(env: VecEnv) -> str:
+    """Return Stable-Baselines3's name of the policy that reads these observations."""
+    if hasattr(env.observation_space, "spaces"):
+        return "MultiInputPolicy"
+    return "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
+
+
+def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:
+    chosen, has_goals = arguments["replay_buffer_class"], is_goal_space(env.observation_space)
+    if chosen == "auto":
+        chosen = HerReplayBuffer if has_goals else None
+    elif chosen == "her":
+        chosen = HerReplayBuffer
+    arguments["replay_buffer_class"] = chosen
+    if chosen is None or not issubclass(chosen, HerReplayBuffer):
+        arguments["replay_buffer_kwargs"] = None
+        return
+    if not has_goals:
+        raise ConfigError(
+            "Hindsight experience replay needs an environment with goals (Dict observations with "
+            "observation, achieved_goal, desired_goal); add ++algorithm.replay_buffer_class=null."
+        )
+    arguments["learning_starts"] = _first_update(arguments, env)
+
+
+def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
+    """Return ``learning_starts``, late enough for one whole episode to have been stored."""
+    limits = [spec.max_episode_steps if spec else None for spec in env.get_attr("spec")]
+    if None in limits:
+        raise ConfigError(
+            "Hindsight experience replay needs a step limit, and this environment has none; add "
+            "+env_kwargs.max_episode_steps=N or ++algorithm.replay_buffer_class=null."
+        )
+    wanted = int(arguments.get("learning_starts", 100))
+    needed = max(limits) * env.num_envs + env.num_envs
+    if wanted < needed:
+        _log.info(
+            "learning_starts raised from %d to %d: hindsight replay needs one whole episode first.",
+            wanted,
+            needed,
+        )
+    return max(wanted, needed)
+
+
+def _shaped_noise(noise: NormalActionNoise, env: VecEnv) -> NormalActionNoise:
+    shape = env.action_space.shape
+    return NormalActionNoise(np.broadcast_to(noise._mu, shape), np.broadcast_to(noise._sigma, shape))

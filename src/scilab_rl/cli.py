@@ -1,0 +1,147 @@
+"""The command line: ``scilab-rl [KEY=VALUE ...]`` trains, ``scilab-rl COMMAND ...`` does the rest."""
+
+from __future__ import annotations
+
+import importlib
+import logging
+import os
+import re
+import sys
+import traceback
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from scilab_rl import __version__
+from scilab_rl.errors import ConfigError, ScilabRLError, did_you_mean
+
+COMMANDS = {
+    "play": "watch or film a trained policy and measure its success",
+    "resume": "continue an interrupted run",
+    "runs": "list the recorded runs",
+    "algorithms": "list the algorithms",
+    "envs": "list the environments",
+    "explain": "show where the value of a key comes from",
+    "doctor": "check the installation and say how to repair it",
+}
+EXIT_INTERRUPTED = 130
+# Parts of the configuration that are dictionaries: their keys can be added without Hydra's plus.
+_OPEN_GROUPS = ("algorithm.", "env_kwargs.")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line and exit with its code."""
+    sys.exit(run_command_line(list(sys.argv[1:] if arguments is None else arguments)))
+
+
+def run_command_line(arguments: list[str]) -> int:
+    """Run one command and return its exit code.
+
+    0: done. 1: the run failed. 2: wrong input, nothing started. 130: interrupted.
+    """
+    debug = "--debug" in arguments
+    arguments = [argument for argument in arguments if argument != "--debug"]
+    _set_up_messages(debug)
+    try:
+        return _dispatch(arguments)
+    except ScilabRLError as error:
+        if debug:
+            traceback.print_exc()
+        sys.stderr.write(f"error: {' '.join(str(error).split())}\n")
+        return error.exit_code
+    except KeyboardInterrupt:
+        sys.stderr.write("interrupted\n")
+        return EXIT_INTERRUPTED
+    except BrokenPipeError:  # the reader of our output has gone, as in `scilab-rl runs | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+
+
+def _dispatch(arguments: list[str]) -> int:
+    first = arguments[0] if arguments else ""
+    if "--version" in arguments:
+        sys.stdout.write(f"scilab-rl {__version__}\n")
+        return 0
+    if first in COMMANDS:
+        module = importlib.import_module(f"scilab_rl.commands.{first}")
+        return int(module.main(arguments[1:]) or 0)
+    if first in ("-h", "--help"):
+        from scilab_rl.commands.help import print_help
+
+        print_help(COMMANDS)
+        return 0
+    if first and not first.startswith("-") and "=" not in first and first != "train":
+        raise ConfigError(
+            f"There is no command '{first}'.{did_you_mean(first, COMMANDS)} "
+            f"Commands: {', '.join(COMMANDS)}. To train, give KEY=VALUE, for example env=FetchPush."
+        )
+    return train(arguments[1:] if first == "train" else arguments)
+
+
+def train(arguments: list[str]) -> int:
+    """Hand the arguments to Hydra, which composes the configuration and calls the experiment."""
+    # Errors shall come to us as exceptions, not as Hydra's report.
+    os.environ["HYDRA_FULL_ERROR"] = "1"
+    import hydra
+    from hydra.core.hydra_config import HydraConfig
+
+    from scilab_rl.config import compose, explain_error
+    from scilab_rl.workspace import open_desk
+
+    outcome: dict[str, Any] = {}
+
+    @hydra.main(version_base="1.3", config_path="pkg://scilab_rl.conf", config_name="main")
+    def task(_: Any) -> float | None:
+        from scilab_rl import experiment
+
+        overrides = list(HydraConfig.get().overrides.task)
+        cfg = compose(overrides)
+        outcome["result"] = experiment.run(cfg, overrides)
+        return outcome["result"].score
+
+    open_desk()
+    original, sys.argv = sys.argv, [sys.argv[0], *map(friendly_override, arguments)]
+    try:
+        task()
+    except (ScilabRLError, KeyboardInterrupt):
+        raise
+    except Exception as error:
+        raise explain_error(error) from error
+    finally:
+        sys.argv = original
+    result = outcome.get("result")
+    return EXIT_INTERRUPTED if result is not None and result.status == "interrupted" else 0
+
+
+def friendly_override(argument: str) -> str:
+    """Add Hydra's ``++`` where a key of an open dictionary is set: it means the same and always works.
+
+    >>> friendly_override("algorithm.gamma=0.9")
+    '++algorithm.gamma=0.9'
+    >>> friendly_override("algorithm=sac")
+    'algorithm=sac'
+    >>> friendly_override("+env_kwargs.reward_type=dense")
+    '++env_kwargs.reward_type=dense'
+    """
+    match = re.match(r"\+{0,2}(?=[a-z])", argument)
+    bare = argument[match.end() :] if match else argument
+    return f"++{bare}" if bare.startswith(_OPEN_GROUPS) and "=" in bare else argument
+
+
+def _set_up_messages(debug: bool) -> None:
+    """Send notices to standard error, one line each, and keep libraries quiet."""
+    logger = logging.getLogger("scilab_rl")
+    logger.handlers.clear()
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setFormatter(logging.Formatter("%(message)s"))
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG if debug else logging.INFO)
+    logger.propagate = False
+    if not debug and not sys.warnoptions:
+        # Deprecations of our dependencies are our business, not the user's.
+        warnings.simplefilter("ignore")
+        os.environ.setdefault("PYTHONWARNINGS", "ignore")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Environments: finding them by id, wrapping, vectorising and observing them."""

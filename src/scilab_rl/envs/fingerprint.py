@@ -1,0 +1,64 @@
+"""A short hash that changes when an environment's behaviour changes under the same name."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+SEED = 1234
+N_STEPS = 20
+DECIMALS = 5
+
+
+def fingerprint(env: gym.Env) -> str:
+    """Return the fingerprint: the first observation of a fixed seed and 20 scripted steps.
+
+    Observations and rewards are rounded to 5 decimals, so that another processor's last bits do
+    not count. The environment is left in an arbitrary state.
+
+    Args:
+        env: Any environment; its wrappers count too, except the step limit.
+    """
+    digest = hashlib.sha256()
+    rng = np.random.default_rng(SEED)
+    observation, _ = env.reset(seed=SEED)
+    _update(digest, observation)
+    for _ in range(N_STEPS):
+        observation, reward, terminated, _, _ = env.step(scripted_action(env.action_space, rng))
+        _update(digest, observation)
+        _update(digest, float(reward))
+        if terminated:
+            break
+    return digest.hexdigest()[:16]
+
+
+def scripted_action(space: gym.Space, rng: np.random.Generator) -> Any:
+    """Return an action that depends on the generator alone, not on Gymnasium's sampling."""
+    if isinstance(space, gym.spaces.Box):
+        low = np.where(np.isfinite(space.low), space.low, -1.0)
+        high = np.where(np.isfinite(space.high), space.high, 1.0)
+        return rng.uniform(low, high).astype(space.dtype)
+    if isinstance(space, gym.spaces.Discrete):
+        return int(space.start + rng.integers(space.n))
+    if isinstance(space, gym.spaces.MultiDiscrete):
+        return rng.integers(space.nvec)
+    if isinstance(space, gym.spaces.MultiBinary):
+        return rng.integers(0, 2, size=space.shape).astype(space.dtype)
+    space.seed(int(rng.integers(2**31)))
+    return space.sample()
+
+
+def _update(digest: Any, value: Any) -> None:
+    if isinstance(value, dict):
+        for key in sorted(value):
+            digest.update(str(key).encode())
+            _update(digest, value[key])
+    elif isinstance(value, tuple):
+        for entry in value:
+            _update(digest, entry)
+    else:
+        # adding 0.0 turns -0.0 into 0.0
+        digest.update((np.round(np.asarray(value, dtype=np.float64), DECIMALS) + 0.0).tobytes())

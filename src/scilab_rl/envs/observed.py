@@ -1,0 +1,183 @@
+"""The one place where every step of every environment can be seen, whatever the algorithm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
+
+from scilab_rl.envs.frames import FRAME_KEY
+from scilab_rl.errors import EnvironmentError_, ScilabRLError
+
+Observation = np.ndarray | dict[str, np.ndarray]
+SUCCESS_KEYS = ("is_success", "success")
+
+
+@dataclass(frozen=True)
+class StepBatch:
+    """One step of all environments of a vector environment.
+
+    Attributes:
+        phase: ``train`` or ``eval``.
+        step: Steps so far over all environments, this one included.
+        episodes: Number of the running episode per environment, from 0. Shapes: ``(n_envs,)``.
+        episode_steps: Index of this step in its episode, from 0. Shapes: ``(n_envs,)``.
+        observations: What the agent saw before it acted. Shapes: ``(n_envs, ...)`` per entry.
+        actions: What it did. Shapes: ``(n_envs, ...)``.
+        rewards: Unscaled rewards. Shapes: ``(n_envs,)``.
+        dones: Whether the episode ended here. Shapes: ``(n_envs,)``.
+        infos: One dictionary per environment; a finished one holds ``terminal_observation``.
+        next_observations: What the agent sees next; after an episode's end this is already the
+            first observation of the next episode.
+        frames: The scene after this step, for environments that capture frames.
+    """
+
+    phase: str
+    step: int
+    episodes: np.ndarray
+    episode_steps: np.ndarray
+    observations: Observation
+    actions: np.ndarray
+    rewards: np.ndarray
+    dones: np.ndarray
+    infos: Sequence[dict[str, Any]]
+    next_observations: Observation
+    frames: Sequence[np.ndarray | None]
+
+
+class StepObserver(Protocol):
+    """Anything that wants to see each step."""
+
+    def on_step(self, batch: StepBatch) -> None:
+        """Look at a step; must not change it."""
+
+
+class ObservedVecEnv(VecEnvWrapper):
+    """Passes each step to its observers and refuses observations that are not finite.
+
+    It wraps the raw vector environment directly, below any normalisation, so that observers see
+    the rewards of the task itself.
+
+    Args:
+        venv: The vector environment.
+        phase: ``train`` or ``eval``.
+        name: How error messages call the environment.
+
+    Attributes:
+        observers: Called in order at each step.
+        step_count: Steps so far over all environments.
+        reset_frame: The first scene of environment 0's running episode, while frames are captured.
+    """
+
+    def __init__(self, venv: VecEnv, phase: str, name: str) -> None:
+        super().__init__(venv)
+        self.phase = phase
+        self.name = name
+        self.observers: list[StepObserver] = []
+        self.step_count = 0
+        self.episodes = np.zeros(self.num_envs, dtype=np.int64)
+        self.episode_steps = np.zeros(self.num_envs, dtype=np.int64)
+        self.reset_frame: np.ndarray | None = None
+        self._observations: Any = None
+        self._actions: Any = None
+
+    def reset(self) -> Any:
+        """Reset all environments; the running episodes are dropped."""
+        with self._errors_named("reset"):
+            self._observations = self.venv.reset()
+        self._check_finite(self._observations, "observation")
+        self.episode_steps[:] = 0
+        self.reset_frame = self.venv.reset_infos[0].pop(FRAME_KEY, None)
+        return self._observations
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Begin a step."""
+        self._actions = actions
+        with self._errors_named("step"):
+            self.venv.step_async(actions)
+
+    def step_wait(self) -> Any:
+        """Finish the step, check it and show it to the observers."""
+        with self._errors_named("step"):
+            observations, rewards, dones, infos = self.venv.step_wait()
+        self._check_finite(observations, "observation")
+        self._check_finite(rewards, "reward")
+        self.step_count += self.num_envs
+        batch = StepBatch(
+            self.phase,
+            self.step_count,
+            self.episodes.copy(),
+            self.episode_steps.copy(),
+            self._observations,
+            self._actions,
+            rewards,
+            dones,
+            infos,
+            observations,
+            [info.pop(FRAME_KEY, None) for info in infos],
+        )
+        for observer in self.observers:
+            observer.on_step(batch)
+        if dones[0]:
+            self.reset_frame = self.venv.reset_infos[0].pop(FRAME_KEY, None)
+        self.episodes += dones
+        self.episode_steps = np.where(dones, 0, self.episode_steps + 1)
+        self._observations = observations
+        return observations, rewards, dones, infos
+
+    def state(self) -> dict[str, Any]:
+        """Return the counters, for a checkpoint."""
+        return {
+            "step_count": self.step_count,
+            "episodes": self.episodes,
+            "episode_steps": self.episode_steps,
+        }
+
+    def continue_from(self, state: Mapping[str, Any], observations: Any) -> None:
+        """Take up the counters of a checkpoint and the observation it was made at."""
+        self.step_count = state["step_count"]
+        self.episodes = np.asarray(state["episodes"])
+        self.episode_steps = np.asarray(state["episode_steps"])
+        self._observations = observations
+
+    def _check_finite(self, values: Any, what: str) -> None:
+        entries = values.items() if isinstance(values, dict) else [("", values)]
+        for key, array in entries:
+            if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
+                index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+                raise EnvironmentError_(
+                    f"{self.name}: {what}{f' {key!r}' if key else ''} is {array[index]} at index "
+                    f"{index[1:]} of environment {index[0]} after step {self.step_count}; last "
+                    f"action {np.asarray(self._actions)[index[0]] if self._actions is not None else None}."
+                )
+
+    def _errors_named(self, call: str) -> _NamedErrors:
+        return _NamedErrors(self, call)
+
+
+class _NamedErrors:
+    """Turns what an environment raises into one line that says which, where and when."""
+
+    def __init__(self, env: ObservedVecEnv, call: str) -> None:
+        self.env, self.call = env, call
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        if isinstance(error, Exception) and not isinstance(error, ScilabRLError):
+            raise EnvironmentError_(
+                f"{self.env.name} raised {type(error).__name__} in {self.call}() at {self.env.phase} "
+                f"step {self.env.step_count}: {error}"
+            ) from error
+
+
+def success_of(info: Mapping[str, Any]) -> bool | None:
+    """Return whether the step's info reports success, or None when the task has no such notion."""
+    for key in SUCCESS_KEYS:
+        if key in info:
+            return bool(info[key])
+    return None

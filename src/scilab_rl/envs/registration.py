@@ -1,0 +1,135 @@
+"""From what the user typed to an environment that this machine can make."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import re
+from collections.abc import Iterable
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
+
+from scilab_rl.errors import ConfigError, MissingDependencyError, did_you_mean
+
+# Suites that register their ids only when they are imported: package -> (extra, start of its ids).
+SUITES: dict[str, tuple[str, tuple[str, ...]]] = {
+    "gymnasium_robotics": (
+        "robotics",
+        ("Fetch", "Hand", "Adroit", "FrankaKitchen", "PointMaze", "AntMaze"),
+    ),
+    "metaworld": ("metaworld", ("MetaW", "Meta-World")),
+    "highway_env": ("highway", ("parking", "highway", "merge", "roundabout", "intersection")),
+    "myosuite": ("myosuite", ("myo",)),
+}
+_VERSIONED = re.compile(r"^(?P<name>.+?)(?:-v(?P<version>\d+))?$")
+# Entry points of ids that stay registered and can no longer be made.
+_ABANDONED = re.compile(r"MujocoPy|mujoco_py")
+
+
+def resolve_env_id(given: str) -> tuple[str, str | None]:
+    """Return the id to make, and a one-line notice when it differs from the given one.
+
+    A name without version means the newest version. A version that is gone or can no longer be
+    made (``FetchPush-v1``) becomes the newest one.
+
+    Args:
+        given: For example ``FetchPush-v4``, ``FetchPush-v1``, ``FetchPush`` or ``module:Id-v0``.
+
+    Raises:
+        ConfigError: If there is no such environment.
+        MissingDependencyError: If the id belongs to a suite that is not installed.
+    """
+    if not isinstance(given, str) or not given.strip():
+        raise ConfigError(f"env must be the id of an environment, but it is {given!r}.")
+    module, _, name = given.rpartition(":")
+    if module:
+        _import_user_module(module, given)
+    _register_suite_of(name)
+    parsed = _VERSIONED.match(name)
+    assert parsed is not None  # the pattern fits every text
+    family, version = parsed["name"], parsed["version"]
+    usable = _usable_versions(family)
+    if not usable and name not in gym.registry:
+        raise ConfigError(f"No environment '{given}'.{_suggestion(name)} `scilab-rl envs` lists all.")
+    if version is not None and (int(version) in usable or not usable):
+        return given, None
+    newest = f"{family}-v{max(usable)}" if usable != [None] else family
+    if version is None:
+        return newest, None
+    return newest, f"{name} is not available any more; using {newest}."
+
+
+def known_env_ids() -> list[str]:
+    """Return the usable ids of all installed suites."""
+    for package in SUITES:
+        if importlib.util.find_spec(package):
+            _register(package)
+    return [spec.id for spec in gym.registry.values() if _is_usable(spec)]
+
+
+def _usable_versions(family: str) -> list:
+    return [
+        spec.version
+        for spec in gym.registry.values()
+        if (f"{spec.namespace}/{spec.name}" if spec.namespace else spec.name) == family
+        and _is_usable(spec)
+    ]
+
+
+def _is_usable(spec: EnvSpec) -> bool:
+    return not _ABANDONED.search(str(spec.entry_point))
+
+
+def _register_suite_of(name: str) -> None:
+    if name in gym.registry and _is_usable(gym.registry[name]):
+        return
+    for package, (extra, beginnings) in SUITES.items():
+        if name.startswith(beginnings):
+            if importlib.util.find_spec(package) is None:
+                raise MissingDependencyError(package, extra, f"for the environment '{name}'")
+            _register(package)
+
+
+def _register(package: str) -> None:
+    module = importlib.import_module(package)
+    gym.register_envs(module)
+
+
+def _import_user_module(module: str, given: str) -> None:
+    try:
+        importlib.import_module(module)
+    except ImportError as error:
+        raise ConfigError(
+            f"The environment '{given}' names the module '{module}', which cannot be imported: "
+            f"{error}."
+        ) from error
+
+
+def _suggestion(name: str) -> str:
+    """Suggest by the name first: a wrong version must not hide the right name."""
+    ids = known_env_ids()
+    newest: dict[str, str] = {}
+    for env_id in sorted(ids, key=_version_of):
+        newest[_family_of(env_id)] = env_id
+    suggestion = did_you_mean(_family_of(name), newest)
+    for family, env_id in newest.items():
+        suggestion = suggestion.replace(f"'{family}'", f"'{env_id}'")
+    return suggestion
+
+
+def _family_of(env_id: str) -> str:
+    return re.sub(r"-v\d+$", "", env_id)
+
+
+def _version_of(env_id: str) -> int:
+    match = re.search(r"-v(\d+)$", env_id)
+    return int(match[1]) if match else -1
+
+
+def versions_by_family(ids: Iterable[str]) -> dict[str, list[str]]:
+    """Group ids by their name without version."""
+    families: dict[str, list[str]] = {}
+    for env_id in sorted(ids, key=lambda i: (_family_of(i), _version_of(i))):
+        families.setdefault(_family_of(env_id), []).append(env_id)
+    return families

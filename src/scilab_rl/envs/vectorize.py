@@ -1,0 +1,133 @@
+"""Making vector environments from an id and a list of wrappers."""
+
+from __future__ import annotations
+
+import inspect
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+
+from scilab_rl.envs.frames import FrameCapture
+from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.replayable import ReplayableEpisode
+from scilab_rl.errors import ConfigError, EnvironmentError_, did_you_mean
+from scilab_rl.seeding import derive_seed
+
+Wrapper = Callable[..., Any]
+
+
+@dataclass(frozen=True)
+class EnvSettings:
+    """How to make an environment; the same for training, evaluation and playing.
+
+    Attributes:
+        env_id: An id that ``gymnasium.make`` knows.
+        env_kwargs: Keyword arguments of the environment.
+        wrappers: Applied in order. A wrapper class of Gymnasium wraps each environment, one of
+            Stable-Baselines3's ``VecEnvWrapper`` the vector of them.
+        n_envs: How many run side by side.
+        vector: ``inprocess`` or ``subprocess``.
+        seed: Seed of the run.
+        render_mode: ``rgb_array`` or ``human`` when frames are wanted.
+    """
+
+    env_id: str
+    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
+    wrappers: Sequence[Wrapper] = ()
+    n_envs: int = 1
+    vector: str = "inprocess"
+    seed: int = 1
+    render_mode: str | None = None
+
+
+def make_train_env(settings: EnvSettings) -> VecEnv:
+    """Make the environments that the algorithm learns in."""
+    return _make(settings, "train")
+
+
+def make_eval_env(settings: EnvSettings) -> VecEnv:
+    """Make the single environment for evaluation, with its own stream of seeds."""
+    env = _make(replace(settings, n_envs=1, vector="inprocess"), "eval")
+    layer: Any = env
+    while isinstance(layer, VecEnvWrapper):
+        if hasattr(layer, "norm_reward"):  # VecNormalize: measure, don't adapt; true rewards
+            layer.training = False
+            layer.norm_reward = False
+        layer = layer.venv
+    return env
+
+
+def make_single_env(settings: EnvSettings) -> gym.Env:
+    """Make one environment with its per-environment wrappers."""
+    try:
+        env = gym.make(settings.env_id, render_mode=settings.render_mode, **settings.env_kwargs)
+        for wrapper in settings.wrappers:
+            if not _wraps_vectors(wrapper):
+                env = wrapper(env)
+        if settings.render_mode == "rgb_array":
+            env = FrameCapture(env)
+    except TypeError as error:
+        raise ConfigError(_explain_type_error(settings, error)) from error
+    except Exception as error:
+        raise EnvironmentError_(
+            f"{settings.env_id} cannot be made: {type(error).__name__}: {error}"
+        ) from error
+    return ReplayableEpisode(env)
+
+
+def observed_layer(env: VecEnv) -> ObservedVecEnv:
+    """Return the layer of a vector environment that shows its steps."""
+    layer: Any = env
+    while not isinstance(layer, ObservedVecEnv):
+        layer = layer.venv
+    return layer
+
+
+def _make(settings: EnvSettings, phase: str) -> VecEnv:
+    makers = [partial(make_single_env, settings) for _ in range(settings.n_envs)]
+    env: VecEnv
+    if settings.vector == "subprocess" and settings.n_envs > 1:
+        env = SubprocVecEnv(makers, start_method=os.environ.get("SCILAB_RL_START_METHOD"))
+    else:
+        env = DummyVecEnv(makers)
+    env = ObservedVecEnv(env, phase, settings.env_id)
+    for wrapper in settings.wrappers:
+        if _wraps_vectors(wrapper):
+            env = wrapper(env)
+    env.seed(derive_seed(settings.seed, phase))
+    return env
+
+
+def _wraps_vectors(wrapper: Wrapper) -> bool:
+    target = getattr(wrapper, "func", wrapper)
+    return inspect.isclass(target) and issubclass(target, VecEnvWrapper)
+
+
+def _explain_type_error(settings: EnvSettings, error: TypeError) -> str:
+    """Name the unknown keyword argument, when that is what the error is about."""
+    for name in settings.env_kwargs:
+        if f"'{name}'" in str(error):
+            allowed = _keyword_arguments(settings.env_id)
+            return (
+                f"{settings.env_id} takes no env_kwargs.{name}.{did_you_mean(name, allowed)} "
+                f"It takes: {', '.join(allowed) or 'none'}."
+            )
+    return f"{settings.env_id} cannot be made with these env_kwargs and wrappers: {error}."
+
+
+def _keyword_arguments(env_id: str) -> list[str]:
+    entry_point = gym.spec(env_id).entry_point
+    if isinstance(entry_point, str):
+        entry_point = gym.envs.registration.load_env_creator(entry_point)  # type: ignore[assignment]
+    parameters: dict[str, None] = {}
+    for cls in getattr(entry_point, "__mro__", [entry_point])[:2]:
+        signature = inspect.signature(cls.__init__ if inspect.isclass(cls) else cls)  # type: ignore[arg-type,misc]
+        parameters |= dict.fromkeys(
+            p.name for p in signature.parameters.values() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)
+        )
+    return [name for name in parameters if name not in ("self", "render_mode")]

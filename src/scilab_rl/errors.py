@@ -1,0 +1,100 @@
+"""Errors for people: what was given, what is allowed, what to do."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class ScilabRLError(Exception):
+    """Something the user can understand and repair; shown as one line.
+
+    Attributes:
+        exit_code: What the command line returns: 1 for a run that failed, 2 for wrong input.
+    """
+
+    exit_code = 1
+
+
+class ConfigError(ScilabRLError):
+    """The configuration or the command line cannot work; nothing has been started."""
+
+    exit_code = 2
+
+
+class MissingDependencyError(ConfigError):
+    """An optional package is needed and not installed.
+
+    Args:
+        package: The package that failed to import.
+        extra: The extra of Scilab-RL that installs it.
+        purpose: What it is needed for, as in "to track runs with MLflow".
+    """
+
+    def __init__(self, package: str, extra: str, purpose: str) -> None:
+        super().__init__(
+            f"{package} is needed {purpose} and is not installed. "
+            f'Install it with: pip install "scilab-rl[{extra}]"'
+        )
+
+
+class AlgorithmError(ScilabRLError):
+    """An algorithm failed while it was learning."""
+
+
+class NumericalError(AlgorithmError):
+    """A NaN or an infinity appeared where a number has to be."""
+
+
+class EnvironmentError_(ScilabRLError):  # noqa: N801 - the built-in has the plain name
+    """An environment failed or broke its contract."""
+
+
+class CheckpointError(ScilabRLError):
+    """A saved policy or checkpoint is damaged or does not fit."""
+
+
+class TrackingError(ScilabRLError):
+    """A tracker could not be opened. Training never depends on one."""
+
+
+class RenderingError(ScilabRLError):
+    """No frame can be drawn on this machine."""
+
+
+def did_you_mean(given: str, allowed: Iterable[str]) -> str:
+    """Return " Did you mean 'x'?" for the nearest allowed word, or an empty string.
+
+    Case and the characters ``-_`` do not count, so that ``fetch_reach-v4`` finds ``FetchReach-v4``.
+
+    >>> did_you_mean("algoritm", ["algorithm", "env"])
+    " Did you mean 'algorithm'?"
+    >>> did_you_mean("zzz", ["algorithm", "env"])
+    ''
+    """
+    nearest = nearest_word(given, allowed)
+    return f" Did you mean '{nearest}'?" if nearest is not None else ""
+
+
+def nearest_word(given: str, allowed: Iterable[str]) -> str | None:
+    """Return the allowed word that is most like the given one, or None when none is near."""
+    plain = {word: word.lower().replace("-", "").replace("_", "") for word in allowed}
+    target = given.lower().replace("-", "").replace("_", "")
+
+    def likeness(word: str) -> float:
+        return difflib.SequenceMatcher(None, target, plain[word]).ratio()
+
+    best = max(plain, key=likeness, default=None)
+    return best if best is not None and likeness(best) >= 0.6 else None
+
+
+def listing(words: Iterable[str], limit: int = 12) -> str:
+    """Return the words in order, separated by commas, and how many more there are.
+
+    >>> listing(["b", "a", "c"], limit=2)
+    'a, b, ... (1 more)'
+    """
+    ordered = sorted(words)
+    shown = ", ".join(ordered[:limit])
+    hidden = len(ordered) - limit
+    return f"{shown}, ... ({hidden} more)" if hidden > 0 else shown

@@ -1,0 +1,324 @@
+"""The story of one run, readable from top to bottom."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import importlib.util
+import logging
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import hydra.utils
+from omegaconf import DictConfig, OmegaConf
+
+from scilab_rl import config, files, provenance
+from scilab_rl.errors import ConfigError, MissingDependencyError, ScilabRLError, did_you_mean
+from scilab_rl.metrics.criteria import final_score
+from scilab_rl.results import CONFIG_FILE, RunDirectory, RunResult
+from scilab_rl.seeding import resolve_seed, seed_everything
+from scilab_rl.tracking.base import RunInfo, TrackerGroup
+from scilab_rl.tracking.files import FilesTracker
+from scilab_rl.tracking.mirror import Mirror
+
+_log = logging.getLogger(__name__)
+_FALLBACK_CRITERION = "eval/mean_reward"
+
+
+def run(cfg: DictConfig, overrides: Sequence[str] = ()) -> RunResult:
+    """Train an algorithm in an environment and leave a complete run behind.
+
+    Args:
+        cfg: The composed configuration.
+        overrides: What the user typed, to be recorded.
+
+    Returns:
+        The result, as it is stored in the run's ``result.json``.
+
+    Raises:
+        ConfigError: If the configuration cannot work; nothing is left behind.
+        ScilabRLError: If the run failed; its directory says how.
+    """
+    cfg = complete(cfg)
+    directory = RunDirectory.create(Path(cfg.base_logdir), cfg.env, cfg.algorithm.name, cfg.seed)
+    try:
+        with _log_file(directory / "train.log"):
+            return _run_in(directory, cfg, overrides)
+    except ConfigError:
+        directory.discard()
+        raise
+
+
+def complete(cfg: DictConfig) -> DictConfig:
+    """Return the checked configuration with the environment's id, names and seed resolved."""
+    from scilab_rl.envs.registration import resolve_env_id
+
+    cfg = config.prepare(cfg)
+    cfg.env, notice = resolve_env_id(cfg.env)
+    if notice:
+        _log.info(notice)
+    cfg.seed = resolve_seed(cfg.seed)
+    algorithm_class(cfg)
+    if config.switched_on(cfg.wandb) and not importlib.util.find_spec("wandb"):
+        raise MissingDependencyError("wandb", "wandb", "to track runs with Weights & Biases")
+    if config.switched_on(cfg.tensorboard) and not importlib.util.find_spec("tensorboard"):
+        raise MissingDependencyError("tensorboard", "tensorboard", "to write TensorBoard files")
+    return cfg
+
+
+def _run_in(directory: RunDirectory, cfg: DictConfig, overrides: Sequence[str]) -> RunResult:
+    from scilab_rl.envs.vectorize import observed_layer
+    from scilab_rl.training.trainer import FINISHED, Trainer
+
+    started = time.monotonic()
+    prepare_torch(cfg)
+    train_env, eval_env = make_environments(cfg)
+    algorithm = make_algorithm(cfg, train_env)
+    restore_policy(cfg, algorithm)
+    files.write_text(directory / CONFIG_FILE, OmegaConf.to_yaml(cfg, resolve=True))
+    provenance.write(directory, overrides, eval_env.envs[0])
+    directory.write_result(RunResult("running", None, 0, 0, 0.0, str(directory)))
+    directory.publish_as_last(Path(cfg.base_logdir))
+
+    trackers = open_trackers(cfg)
+    trainer = Trainer(training_plan(cfg), eval_env, trackers, directory.path)
+    trainer.watch(algorithm, observed_layer(train_env))
+    record_videos(cfg, trainer, directory)
+    trackers.begin(run_info(cfg, directory, trainer.total_steps))
+    status, error = "failed", None
+    try:
+        algorithm.learn(trainer.total_steps, callback=trainer, log_interval=None)
+        status = "stopped_early" if trainer.stopped_early else "finished"
+        trainer.save_policy(FINISHED)
+    except KeyboardInterrupt:
+        status = "interrupted"
+        trainer.save_policy(FINISHED)
+    except Exception as raised:
+        error = str(raised) or type(raised).__name__
+        files.write_text(directory / "error.log", traceback.format_exc())
+        if isinstance(raised, ScilabRLError):
+            raise
+        raise ScilabRLError(f"{type(raised).__name__}: {error} (see {directory / 'error.log'})") from raised
+    finally:
+        result = RunResult(
+            status=status,
+            score=None if status == "failed" else score(trainer.store, cfg),
+            epochs=trainer.n_epochs_done,
+            steps=trainer.num_timesteps,
+            seconds=time.monotonic() - started,
+            run_dir=str(directory),
+            metrics=trainer.store.rows[-1] if trainer.store.rows else {},
+            error=error,
+        )
+        directory.write_result(result)
+        trackers.end(result)
+        train_env.close()
+        eval_env.close()
+    return result
+
+
+def prepare_torch(cfg: DictConfig) -> None:
+    """Set threads and seeds before anything draws a random number."""
+    import torch
+
+    torch.set_num_threads(cfg.n_threads)
+    seed_everything(cfg.seed)
+
+
+def make_environments(cfg: DictConfig) -> tuple[Any, Any]:
+    """Make the training environments and the one for evaluation."""
+    from dataclasses import replace
+
+    from scilab_rl.envs.vectorize import make_eval_env, make_train_env
+
+    settings = env_settings(cfg)
+    render_mode = None
+    if cfg.render == "record":
+        from scilab_rl.visualization.gl import choose_backend
+
+        choose_backend()
+        render_mode = "rgb_array"
+    return make_train_env(settings), make_eval_env(replace(settings, render_mode=render_mode))
+
+
+def env_settings(cfg: DictConfig) -> Any:
+    """Return how to make the run's environments."""
+    from scilab_rl.envs.vectorize import EnvSettings
+
+    return EnvSettings(
+        env_id=cfg.env,
+        env_kwargs=OmegaConf.to_container(cfg.env_kwargs, resolve=True),  # type: ignore[arg-type]
+        wrappers=[_partial(wrapper, "wrappers") for wrapper in cfg.wrappers],
+        n_envs=cfg.n_envs,
+        vector=cfg.vector,
+        seed=cfg.seed,
+    )
+
+
+def make_algorithm(cfg: DictConfig, train_env: Any) -> Any:
+    """Build the algorithm that ``algorithm._target_`` names.
+
+    Raises:
+        ConfigError: If it cannot learn in this environment.
+    """
+    from scilab_rl.algorithms.build import build_algorithm
+    from scilab_rl.algorithms.compatibility import check_pair
+
+    cls = algorithm_class(cfg)
+    check_pair(cfg.algorithm.name, cls, cfg.env, train_env, _fitting_algorithms(train_env))
+    arguments = hydra.utils.instantiate(_arguments(cfg), _convert_="all")
+    buffer = arguments.get("replay_buffer_class")
+    if isinstance(buffer, str) and buffer not in ("auto", "her"):
+        arguments["replay_buffer_class"] = hydra.utils.get_class(buffer)
+    return build_algorithm(cls, arguments, train_env, seed=cfg.seed, device=cfg.device)
+
+
+def algorithm_class(cfg: DictConfig) -> type:
+    """Import the algorithm's class and check its keyword arguments.
+
+    Raises:
+        ConfigError: If there is no such class or parameter.
+    """
+    from scilab_rl.algorithms.arguments import check_arguments
+
+    cls = _import_target(cfg.algorithm._target_, "algorithm")
+    check_arguments(cfg.algorithm.get("name", cls.__name__), cls, _arguments(cfg))
+    return cls
+
+
+def restore_policy(cfg: DictConfig, algorithm: Any) -> None:
+    """Start from the saved policy that ``restore_policy`` names, if it names one."""
+    if cfg.restore_policy is None:
+        return
+    from scilab_rl.training.trainer import load_policy
+
+    load_policy(algorithm, Path(cfg.restore_policy))
+    _log.info("Policy restored from %s.", cfg.restore_policy)
+
+
+def open_trackers(cfg: DictConfig) -> TrackerGroup:
+    """Build the trackers that are switched on; all but files and console may fail."""
+    trackers: list[Any] = [FilesTracker()]
+    for name, tracker in cfg.tracking.items():
+        if not config.switched_on(tracker.enabled, package=name):
+            continue
+        built = hydra.utils.instantiate({k: v for k, v in tracker.items() if k != "enabled"})
+        trackers.append(built if name == "console" else Mirror(built, name))
+    return TrackerGroup(trackers)
+
+
+def training_plan(cfg: DictConfig) -> Any:
+    """Pick the numbers that shape the training from the configuration."""
+    import dataclasses
+
+    from scilab_rl.training.trainer import TrainingPlan
+
+    return TrainingPlan(**{field.name: cfg[field.name] for field in dataclasses.fields(TrainingPlan)})
+
+
+def record_videos(cfg: DictConfig, trainer: Any, directory: RunDirectory) -> None:
+    """Film one evaluation episode every ``render_freq`` epochs, with ``render=record``."""
+    if cfg.render != "record":
+        return
+    from scilab_rl.envs.vectorize import observed_layer
+    from scilab_rl.visualization.recorder import EpisodeRecorder
+
+    recorder = EpisodeRecorder(observed_layer(trainer.eval_env), trainer.trackers.artifact)
+
+    def film(epoch: int) -> None:
+        if epoch % cfg.render_freq == 0 or epoch == 1:
+            recorder.arm(directory / "videos" / f"eval_epoch_{epoch:04d}.mp4")
+
+    trainer.before_evaluation.append(film)
+
+
+def run_info(cfg: DictConfig, directory: RunDirectory, total_steps: int) -> RunInfo:
+    """Collect what trackers want to know."""
+    return RunInfo(
+        run_dir=directory.path,
+        base_logdir=Path(cfg.base_logdir),
+        env=cfg.env,
+        algorithm=cfg.algorithm.name,
+        seed=cfg.seed,
+        total_steps=total_steps,
+        n_epochs=cfg.n_epochs,
+        parameters=config.flat(cfg),
+        project=cfg.project_name,
+        entity=cfg.entity,
+        group=cfg.group,
+        tags=tuple(cfg.tags or ()),
+        notes=cfg.info,
+    )
+
+
+def score(store: Any, cfg: DictConfig) -> float | None:
+    """Return the run's score; tasks without a notion of success are scored by reward."""
+    value = final_score(store, cfg.hyperopt_criterion)
+    if value is None and cfg.hyperopt_criterion.startswith("eval/success"):
+        return final_score(store, _FALLBACK_CRITERION)
+    return value
+
+
+def _arguments(cfg: DictConfig) -> dict[str, Any]:
+    container = OmegaConf.to_container(cfg.algorithm, resolve=True)
+    assert isinstance(container, dict)
+    return {str(key): value for key, value in container.items() if key not in ("name", "_target_")}
+
+
+def _partial(target: Any, key: str) -> Callable[..., Any]:
+    """Return the class of a ``_target_`` entry with its arguments bound."""
+    if not OmegaConf.is_config(target) or "_target_" not in target:
+        raise ConfigError(f"Each entry of {key} needs a _target_, but there is {target!r}.")
+    _import_target(target._target_, key)
+    return hydra.utils.instantiate(target, _partial_=True, _convert_="all")
+
+
+def _import_target(target: str, key: str) -> Any:
+    """Import ``package.module.Class`` and explain what is missing when it fails."""
+    module_name, _, name = target.rpartition(".")
+    try:
+        module = importlib.import_module(module_name)
+    except ImportError as error:
+        raise ConfigError(
+            f"{key}._target_: '{target}' cannot be imported: {error}. The class in "
+            f"src/custom_algorithms/my_idea.py is custom_algorithms.my_idea.CLASS."
+        ) from error
+    if not hasattr(module, name):
+        classes = [word for word in vars(module) if isinstance(vars(module)[word], type)]
+        raise ConfigError(
+            f"{key}._target_: there is no '{name}' in {module_name}.{did_you_mean(name, classes)}"
+        )
+    return getattr(module, name)
+
+
+def _fitting_algorithms(env: Any) -> list[str]:
+    """Return the names of the algorithms whose class accepts these spaces."""
+    from scilab_rl.algorithms.compatibility import check_pair
+    from scilab_rl.workspace import config_files
+
+    fitting = []
+    for name, path in config_files("algorithm").items():
+        target = OmegaConf.load(path).get("_target_", "")
+        try:
+            check_pair(name, _import_target(target, name), "", env)
+        except ConfigError:
+            continue
+        fitting.append(name)
+    return fitting
+
+
+@contextlib.contextmanager
+def _log_file(path: Path) -> Iterator[None]:
+    """Write the package's log messages to a file too."""
+    handler = logging.FileHandler(path, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logger = logging.getLogger("scilab_rl")
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+        handler.close()

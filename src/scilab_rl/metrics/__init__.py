@@ -1,0 +1,1 @@
+"""Metrics: recorded by algorithms, kept in one store, judged by pure functions."""

@@ -1,0 +1,1 @@
+"""Tracking: one file per place where metrics can go."""

@@ -1,0 +1,109 @@
+"""The run's own files: the only truth, written before any mirror hears of it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import IO, Any
+
+from scilab_rl import files
+from scilab_rl.errors import ScilabRLError
+from scilab_rl.results import RunResult
+from scilab_rl.tracking.base import RunInfo, Tracker
+
+CSV, JSONL = "metrics.csv", "metrics.jsonl"
+
+
+class FilesTracker(Tracker):
+    """Writes ``metrics.csv``, one row per epoch, and ``metrics.jsonl``, one line per epoch or episode.
+
+    In ``metrics.csv`` the columns ``time/...`` come last: all others repeat exactly under a seed.
+    """
+
+    def __init__(self) -> None:
+        self._rows: list[dict[str, float]] = []
+        self._columns: list[str] = []
+        self._jsonl: IO[str] | None = None
+        self._run_dir = Path()
+
+    def begin(self, run: RunInfo) -> None:
+        """Open the files for appending."""
+        self._run_dir = run.run_dir
+        self._jsonl = (run.run_dir / JSONL).open("a", encoding="utf-8", buffering=1)
+
+    def episode(self, episode: Mapping[str, Any]) -> None:
+        """Append a line about a training episode."""
+        self._write_line({"kind": "episode", **episode})
+
+    def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
+        """Append a row to both files."""
+        row = {"epoch": epoch, "step": step, **values}
+        self._write_line({"kind": "epoch", **row})
+        self._rows.append(row)
+        with self._errors_named(CSV):
+            self._append_csv(row)
+
+    def end(self, result: RunResult) -> None:
+        """Close the files."""
+        if self._jsonl is not None:
+            self._jsonl.close()
+
+    def _write_line(self, line: Mapping[str, Any]) -> None:
+        assert self._jsonl is not None
+        with self._errors_named(JSONL):
+            self._jsonl.write(json.dumps(line) + "\n")
+
+    def _append_csv(self, row: Mapping[str, float]) -> None:
+        path = self._run_dir / CSV
+        if set(row) <= set(self._columns):
+            with path.open("a", encoding="utf-8", newline="") as file:
+                file.write(self._format([row], header=False))
+            return
+        self._columns = _ordered_columns([*self._columns, *row])
+        files.write_text(path, self._format(self._rows, header=True))
+
+    def _format(self, rows: list[Any], *, header: bool) -> str:
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, self._columns, restval="", lineterminator="\n")
+        if header:
+            writer.writeheader()
+        writer.writerows(rows)
+        return text.getvalue()
+
+    def _errors_named(self, name: str) -> _DiskErrors:
+        return _DiskErrors(self._run_dir / name)
+
+
+class _DiskErrors:
+    """Says which file could not be written and how much space is left."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        if isinstance(error, OSError):
+            raise ScilabRLError(
+                f"'{self.path}' cannot be written: {error.strerror} ({_free_space(self.path)} free)."
+            ) from error
+
+
+def _free_space(path: Path) -> str:
+    try:
+        return f"{shutil.disk_usage(path.parent).free / 2**20:.0f} MiB"
+    except OSError:
+        return "unknown space"
+
+
+def _ordered_columns(names: list[str]) -> list[str]:
+    unique = dict.fromkeys(names)
+    first = [name for name in ("epoch", "step") if name in unique]
+    timed = sorted(name for name in unique if name.startswith("time/"))
+    others = sorted(name for name in unique if name not in first and name not in timed)
+    return first + others + timed

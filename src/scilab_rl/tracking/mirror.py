@@ -1,0 +1,98 @@
+"""Trackers that may fail, be slow or hang, without the training noticing."""
+
+from __future__ import annotations
+
+import logging
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from scilab_rl.results import RunResult
+from scilab_rl.tracking.base import RunInfo, Tracker
+
+_log = logging.getLogger(__name__)
+
+
+class Mirror(Tracker):
+    """Feeds a tracker from a thread of its own, through a bounded queue.
+
+    After ``max_failures`` failures in a row the tracker is switched off with one warning; what it
+    missed is complete in the run's own files.
+
+    Args:
+        tracker: The tracker to feed.
+        label: Its name in the warning.
+        queue_size: Most waiting messages; further ones are dropped.
+        max_failures: Failures in a row until it is switched off.
+        patience_seconds: How long the end of a run waits for the queue to empty.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        label: str,
+        *,
+        queue_size: int = 10_000,
+        max_failures: int = 3,
+        patience_seconds: float = 10.0,
+    ) -> None:
+        self.tracker = tracker
+        self.label = label
+        self.max_failures = max_failures
+        self.patience_seconds = patience_seconds
+        self._messages: queue.Queue[Callable[[], object] | None] = queue.Queue(queue_size)
+        self._thread = threading.Thread(target=self._work, name=f"{label} mirror", daemon=True)
+        self._failures = 0
+        self._off = False
+
+    def begin(self, run: RunInfo) -> None:
+        """Start the thread; the tracker itself is opened there."""
+        self._thread.start()
+        self._put(lambda: self.tracker.begin(run))
+
+    def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
+        """Queue an epoch."""
+        copied = dict(values)
+        self._put(lambda: self.tracker.epoch(step, epoch, copied))
+
+    def artifact(self, path: Path) -> None:
+        """Queue a file."""
+        self._put(lambda: self.tracker.artifact(path))
+
+    def end(self, result: RunResult) -> None:
+        """Queue the end and wait a while for everything to be written."""
+        self._put(lambda: self.tracker.end(result))
+        self._put(None)
+        self._thread.join(self.patience_seconds)
+        if self._thread.is_alive():
+            self._switch_off(f"it did not finish within {self.patience_seconds:g} s")
+
+    def _put(self, message: Callable[[], object] | None) -> None:
+        try:
+            self._messages.put_nowait(message)
+        except queue.Full:
+            self._switch_off("it is too slow")
+
+    def _work(self) -> None:
+        opened = False
+        while (message := self._messages.get()) is not None:
+            if self._off:
+                continue
+            try:
+                message()
+                opened, self._failures = True, 0
+            except Exception as error:  # noqa: BLE001 - a mirror must survive whatever a tracker raises
+                self._failures += 1
+                if not opened or self._failures >= self.max_failures:
+                    self._switch_off(str(error).strip().partition("\n")[0] or type(error).__name__)
+
+    def _switch_off(self, reason: str) -> None:
+        if not self._off:
+            self._off = True
+            _log.warning(
+                "%s is switched off for this run: %s. Nothing is lost: all metrics are in the "
+                "run's own files.",
+                self.label,
+                reason,
+            )

@@ -1,0 +1,1 @@
+"""Training: the epoch loop, the one evaluation loop, and what is saved."""

@@ -1,0 +1,162 @@
+"""Saving snapshots so that a damaged one is noticed before anything is loaded from it.
+
+A saved directory holds ``tensors.safetensors``, ``arrays/*.npy``, ``state.json`` and, written last,
+``manifest.json`` with the size and the SHA-256 of each. No pickle is read or written.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import shutil
+import zipfile
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from scilab_rl import files
+from scilab_rl.errors import CheckpointError, ConfigError
+from scilab_rl.training.snapshot import Snapshot
+
+SCHEMA_VERSION = 1
+MANIFEST = "manifest.json"
+_TENSORS, _STATE, _ARRAYS = "tensors.safetensors", "state.json", "arrays"
+_VERSIONED = ("torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
+
+
+def save(snapshot: Snapshot, directory: Path, *, step: int, about: dict[str, Any] | None = None) -> None:
+    """Write a snapshot; an existing one of the same name is replaced only by a complete one.
+
+    Args:
+        snapshot: What to save.
+        directory: For example ``<run>/rl_model_best``.
+        step: Environment steps so far, for the manifest.
+        about: More facts for the manifest.
+    """
+    unfinished = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
+    shutil.rmtree(unfinished, ignore_errors=True)
+    (unfinished / _ARRAYS).mkdir(parents=True)
+    try:
+        _write_content(snapshot, unfinished)
+        _write_manifest(unfinished, step, about or {})
+        _swap(unfinished, directory)
+    finally:
+        shutil.rmtree(unfinished, ignore_errors=True)
+
+
+def load(directory: Path) -> Snapshot:
+    """Read a snapshot after checking that it is whole.
+
+    Raises:
+        CheckpointError: If a file is missing, cut, changed or of another schema.
+    """
+    verify(directory)
+    try:
+        stored = json.loads((directory / _STATE).read_text(encoding="utf-8"))
+        arrays = {
+            name: np.load(directory / _ARRAYS / file, mmap_mode="r", allow_pickle=False)
+            for name, file in stored["arrays"].items()
+        }
+        return Snapshot(stored["tree"], load_file(directory / _TENSORS), arrays)
+    except (OSError, ValueError, KeyError, SafetensorError) as error:
+        raise CheckpointError(f"'{directory}' cannot be read: {error}") from error
+
+
+def verify(directory: Path) -> dict[str, Any]:
+    """Return the manifest of a saved directory after comparing every file with it.
+
+    Raises:
+        CheckpointError: If it does not hold.
+    """
+    _refuse_foreign_formats(directory)
+    try:
+        manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
+        entries = manifest["files"].items()
+        schema = manifest["schema_version"]
+    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+        raise CheckpointError(f"'{directory}' is no complete checkpoint: {error}") from error
+    if schema != SCHEMA_VERSION:
+        raise CheckpointError(
+            f"'{directory}' has format {schema}; this version of Scilab-RL reads {SCHEMA_VERSION}."
+        )
+    for name, expected in entries:
+        path = directory / name
+        if not path.resolve().is_relative_to(directory.resolve()) or not path.is_file():
+            raise CheckpointError(f"'{directory}' is damaged: {name} is missing.")
+        if path.stat().st_size != expected["bytes"] or files.sha256(path) != expected["sha256"]:
+            raise CheckpointError(f"'{directory}' is damaged: {name} has changed since it was saved.")
+    if {_TENSORS, _STATE} - set(manifest["files"]):
+        raise CheckpointError(f"'{directory}' is damaged: its manifest lists no state.")
+    return manifest
+
+
+def _refuse_foreign_formats(directory: Path) -> None:
+    if directory.is_file() and zipfile.is_zipfile(directory):
+        raise ConfigError(
+            f"'{directory}' is a zip of Stable-Baselines3, which runs code when it is loaded "
+            "(pickle). If you trust its source, add --trust-pickle."
+        )
+    if not directory.is_dir():
+        raise ConfigError(f"There is no saved policy in '{directory}'.")
+
+
+def _write_content(snapshot: Snapshot, directory: Path) -> None:
+    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in snapshot.tensors.items()}
+    save_file(tensors, directory / _TENSORS)
+    names = {}
+    for index, (name, array) in enumerate(snapshot.arrays.items()):
+        names[name] = f"{index}.npy"
+        with (directory / _ARRAYS / names[name]).open("wb") as file:
+            np.save(file, array, allow_pickle=False)
+            file.flush()
+            os.fsync(file.fileno())
+    files.write_json(directory / _STATE, {"arrays": names, "tree": snapshot.tree})
+
+
+def _write_manifest(directory: Path, step: int, about: dict[str, Any]) -> None:
+    contents = sorted(path for path in directory.rglob("*") if path.is_file())
+    files.write_json(
+        directory / MANIFEST,
+        {
+            "schema_version": SCHEMA_VERSION,
+            "step": step,
+            **about,
+            "versions": {"python": platform.python_version()} | _versions(),
+            "files": {
+                str(path.relative_to(directory)): {
+                    "bytes": path.stat().st_size,
+                    "sha256": files.sha256(path),
+                }
+                for path in contents
+            },
+        },
+    )
+
+
+def _versions() -> dict[str, str]:
+    installed = {}
+    for package in _VERSIONED:
+        try:
+            installed[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return installed
+
+
+def _swap(finished: Path, directory: Path) -> None:
+    """Put the finished directory in its place; a directory cannot replace a full one in one step.
+
+    Between the two renames the older state lies under ``<name>.old``, where `load_latest` finds it.
+    """
+    previous = directory.with_name(f"{directory.name}.old")
+    if directory.exists():
+        shutil.rmtree(previous, ignore_errors=True)
+        directory.rename(previous)
+    finished.rename(directory)
+    files.fsync_directory(directory.parent)
+    shutil.rmtree(previous, ignore_errors=True)

@@ -1,0 +1,325 @@
+"""The complete state of a learning algorithm as plain data: tensors, arrays and JSON.
+
+`capture` walks through the attributes of an object and describes each one; `restore` puts the
+description back into an object that was built the same way. Nothing in a description is ever
+executed, and only attributes that the object already has are set. One mechanism serves every
+algorithm, so that an idea that adds a network or a counter is saved without a line of code.
+
+What is captured: tensors, modules, optimizers, arrays, numbers, text, containers of these, random
+generators, and objects of the packages that algorithms are made of (replay buffers, noise,
+normalisation). What is not: environments, loggers, functions, spaces apart from their generators.
+"""
+
+from __future__ import annotations
+
+import random
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import torch
+from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv
+
+from scilab_rl.errors import CheckpointError
+from scilab_rl.metrics.logger import MetricLogger
+
+Node = Any  # JSON: a plain value, or {"@kind": ...}
+
+_OPEN_PACKAGES = ("stable_baselines3", "sb3_contrib", "scilab_rl", "custom_algorithms")
+_CLOSED = (VecEnv, gym.Env, MetricLogger, BaseCallback, torch.device, torch.dtype, type)
+
+
+@dataclass
+class Snapshot:
+    """A captured state.
+
+    Attributes:
+        tree: The JSON description; refers to tensors and arrays by name.
+        tensors: Parameters, optimizer moments and other tensors.
+        arrays: NumPy arrays; replay buffers are views, not copies.
+    """
+
+    tree: Node = None
+    tensors: dict[str, torch.Tensor] = field(default_factory=dict)
+    arrays: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def capture(state: dict[str, Any], *, with_buffers: bool = True) -> Snapshot:
+    """Describe named objects.
+
+    Args:
+        state: Name to object, for example ``{"algorithm": model}``.
+        with_buffers: Whether replay buffers are included.
+    """
+    snapshot = Snapshot()
+    walker = _Capture(snapshot, with_buffers, _packages_of(state))
+    snapshot.tree = {name: walker.describe(value, name) for name, value in state.items()}
+    return snapshot
+
+
+def restore(state: dict[str, Any], snapshot: Snapshot) -> dict[str, Any]:
+    """Put a captured state back.
+
+    Args:
+        state: Name to object, built as those that were captured; changed in place.
+        snapshot: From `capture`, perhaps in another process.
+
+    Returns:
+        Name to restored value; differs from ``state`` for values that cannot change in place.
+
+    Raises:
+        CheckpointError: If the snapshot does not fit the objects.
+    """
+    walker = _Restore(snapshot)
+    try:
+        return {
+            name: walker.put(state.get(name), node)
+            for name, node in snapshot.tree.items()
+            if name in state
+        }
+    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(f"The saved state does not fit this algorithm: {error}") from error
+
+
+def random_state() -> dict[str, Any]:
+    """Return the state of the global generators of Python, NumPy and PyTorch."""
+    version, words, gauss = random.getstate()
+    kind, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
+    state: dict[str, Any] = {
+        "python": [version, list(words), gauss],
+        "numpy": [kind, np.asarray(keys), position, has_gauss, cached],
+        "torch": torch.get_rng_state(),
+    }
+    if torch.cuda.is_available():
+        state["cuda"] = torch.cuda.get_rng_state()
+    return state
+
+
+def set_random_state(state: dict[str, Any]) -> None:
+    """Set the global generators to a state from `random_state`."""
+    version, words, gauss = state["python"]
+    random.setstate((version, tuple(words), gauss))
+    np.random.set_state(tuple(state["numpy"]))
+    torch.set_rng_state(state["torch"])
+    if "cuda" in state and torch.cuda.is_available():
+        torch.cuda.set_rng_state(state["cuda"])
+
+
+def _packages_of(state: dict[str, Any]) -> tuple[str, ...]:
+    """Return the packages whose objects are walked into: ours, and the algorithm's own."""
+    own = {type(value).__module__.partition(".")[0] for value in state.values()}
+    return (*_OPEN_PACKAGES, *(own - {"builtins", "numpy", "torch", "collections"}))
+
+
+class _Capture:
+    def __init__(self, snapshot: Snapshot, with_buffers: bool, packages: tuple[str, ...]) -> None:
+        self.snapshot = snapshot
+        self.with_buffers = with_buffers
+        self.packages = packages
+        self.seen: set[int] = set()
+
+    def describe(self, value: Any, path: str, rows: int | None = None) -> Node:
+        """Describe one value; ``rows`` is the filled length of the buffer it belongs to."""
+        if value is None or isinstance(value, (bool, int, float, str)):
+            return value
+        if isinstance(value, np.generic):
+            return value.item()
+        if isinstance(value, torch.Tensor):
+            return self._tensor(value, path)
+        if isinstance(value, np.ndarray):
+            return self._array(value, path, rows)
+        if isinstance(value, (dict, list, tuple, deque)):
+            return self._container(value, path, rows)
+        if isinstance(value, _CLOSED) or id(value) in self.seen:
+            return {"@kind": "skip"}
+        self.seen.add(id(value))
+        for kinds, describe in self._object_kinds():
+            if isinstance(value, kinds):
+                return describe(value, path)
+        if hasattr(value, "__dict__") and type(value).__module__.startswith(self.packages):
+            return self._object(value, path)
+        return {"@kind": "skip"}
+
+    def _object_kinds(self) -> list[tuple[Any, Callable[[Any, str], Node]]]:
+        return [
+            (torch.nn.Module, self._module),
+            (torch.optim.Optimizer, self._optimizer),
+            (np.random.Generator, lambda g, _: {"@kind": "generator", "state": g.bit_generator.state}),
+            (torch.Generator, lambda g, path: self._tensor(g.get_state(), path) | {"@kind": "torch_generator"}),
+            (gym.Space, self._space),
+            (BaseBuffer, self._buffer),
+        ]
+
+    def _tensor(self, value: torch.Tensor, path: str) -> Node:
+        self.snapshot.tensors[path] = value.detach()
+        return {"@kind": "tensor", "name": path}
+
+    def _array(self, value: np.ndarray, path: str, rows: int | None) -> Node:
+        if value.dtype.hasobject:
+            return {"@kind": "skip"}
+        self.snapshot.arrays[path] = value if rows is None else value[:rows]
+        return {"@kind": "array", "name": path}
+
+    def _container(self, value: Any, path: str, rows: int | None) -> Node:
+        if isinstance(value, dict):
+            entries: Any = {
+                str(key): self.describe(entry, f"{path}.{key}", rows) for key, entry in value.items()
+            }
+            return {"@kind": "dict", "entries": entries}
+        entries = [self.describe(entry, f"{path}.{i}", rows) for i, entry in enumerate(value)]
+        return {"@kind": type(value).__name__ if not _is_named_tuple(value) else "skip", "entries": entries}
+
+    def _module(self, module: torch.nn.Module, path: str) -> Node:
+        names = []
+        for name, tensor in module.state_dict().items():
+            if isinstance(tensor, torch.Tensor):
+                self._tensor(tensor, f"{path}.{name}")
+                names.append(name)
+        optimizers = {}
+        for name, part in module.named_modules():
+            self.seen.add(id(part))
+            for attribute, value in vars(part).items():
+                if isinstance(value, torch.optim.Optimizer) and id(value) not in self.seen:
+                    key = f"{name}.{attribute}".lstrip(".")
+                    optimizers[key] = self.describe(value, f"{path}.{key}")
+        return {"@kind": "module", "path": path, "names": names, "optimizers": optimizers}
+
+    def _optimizer(self, optimizer: torch.optim.Optimizer, path: str) -> Node:
+        state = optimizer.state_dict()
+        return {
+            "@kind": "optimizer",
+            "groups": self.describe(state["param_groups"], f"{path}.groups"),
+            "state": self.describe(state["state"], f"{path}.state"),
+        }
+
+    def _space(self, space: gym.Space, path: str) -> Node:
+        return {"@kind": "space", "state": space.np_random.bit_generator.state}
+
+    def _buffer(self, buffer: BaseBuffer, path: str) -> Node:
+        if isinstance(buffer, RolloutBuffer):  # refilled from the start in the next rollout
+            return {"@kind": "skip"}
+        if not self.with_buffers:
+            return {"@kind": "skip"}
+        rows = buffer.buffer_size if buffer.full else buffer.pos
+        return self._object(buffer, path, rows)
+
+    def _object(self, value: Any, path: str, rows: int | None = None) -> Node:
+        attributes = {
+            name: self.describe(attribute, f"{path}.{name}", rows)
+            for name, attribute in vars(value).items()
+            if not callable(attribute) or isinstance(attribute, torch.nn.Module)
+        }
+        kept = {name: node for name, node in attributes.items() if node != {"@kind": "skip"}}
+        return {"@kind": "object", "attributes": kept}
+
+
+class _Restore:
+    def __init__(self, snapshot: Snapshot) -> None:
+        self.snapshot = snapshot
+
+    def put(self, current: Any, node: Node) -> Any:
+        """Return what belongs in the place of ``current``, changed in place where possible."""
+        if not isinstance(node, dict) or "@kind" not in node:
+            return node
+        kind = node["@kind"]
+        if kind == "skip":
+            return current
+        return getattr(self, f"_put_{kind}")(current, node)
+
+    def _put_tensor(self, current: Any, node: Node) -> Any:
+        saved = self.snapshot.tensors[node["name"]]
+        if isinstance(current, torch.Tensor):
+            with torch.no_grad():
+                current.copy_(saved)
+            return current
+        return saved.clone()
+
+    def _put_array(self, current: Any, node: Node) -> Any:
+        saved = self.snapshot.arrays[node["name"]]
+        fits = (
+            isinstance(current, np.ndarray)
+            and current.flags.writeable
+            and current.ndim == saved.ndim > 0
+            and current.dtype == saved.dtype
+            and current.shape[1:] == saved.shape[1:]
+            and len(saved) <= len(current)
+        )
+        if not fits:
+            return np.array(saved)
+        current[: len(saved)] = saved
+        return current
+
+    def _put_dict(self, current: Any, node: Node) -> dict:
+        known = {str(key): key for key in current} if isinstance(current, dict) else {}
+        restored = {
+            known.get(key, key): self.put(current[known[key]] if key in known else None, entry)
+            for key, entry in node["entries"].items()
+        }
+        if isinstance(current, dict):
+            current.update(restored)
+            return current
+        return restored
+
+    def _put_list(self, current: Any, node: Node) -> list:
+        olds = list(current) if isinstance(current, list) else []
+        olds += [None] * (len(node["entries"]) - len(olds))
+        restored = [self.put(old, entry) for old, entry in zip(olds, node["entries"], strict=False)]
+        if isinstance(current, list):
+            current[:] = restored
+            return current
+        return restored
+
+    def _put_tuple(self, current: Any, node: Node) -> tuple:
+        return tuple(self._put_list(list(current or ()), node))
+
+    def _put_deque(self, current: Any, node: Node) -> deque:
+        restored: deque = deque(maxlen=getattr(current, "maxlen", None))
+        restored.extend(self.put(None, entry) for entry in node["entries"])
+        return restored
+
+    def _put_module(self, current: torch.nn.Module, node: Node) -> torch.nn.Module:
+        saved = {name: self.snapshot.tensors[f"{node['path']}.{name}"] for name in node["names"]}
+        current.load_state_dict(saved, strict=False)
+        missing = set(current.state_dict()) - set(saved)
+        if any(isinstance(current.state_dict()[name], torch.Tensor) for name in missing):
+            raise KeyError(f"no saved values for {sorted(missing)}")
+        for key, optimizer in node["optimizers"].items():
+            owner, _, attribute = key.rpartition(".")
+            self.put(getattr(current.get_submodule(owner), attribute), optimizer)
+        return current
+
+    def _put_optimizer(self, current: torch.optim.Optimizer, node: Node) -> torch.optim.Optimizer:
+        groups = self.put(None, node["groups"])
+        state = self.put(None, node["state"])
+        current.load_state_dict(
+            {"param_groups": groups, "state": {int(index): entry for index, entry in state.items()}}
+        )
+        return current
+
+    def _put_generator(self, current: np.random.Generator, node: Node) -> np.random.Generator:
+        current.bit_generator.state = node["state"]
+        return current
+
+    def _put_torch_generator(self, current: torch.Generator, node: Node) -> torch.Generator:
+        current.set_state(self.snapshot.tensors[node["name"]])
+        return current
+
+    def _put_space(self, current: gym.Space, node: Node) -> gym.Space:
+        current.np_random.bit_generator.state = node["state"]
+        return current
+
+    def _put_object(self, current: Any, node: Node) -> Any:
+        attributes = vars(current)
+        for name, entry in node["attributes"].items():
+            if name in attributes:
+                setattr(current, name, self.put(attributes[name], entry))
+        return current
+
+
+def _is_named_tuple(value: Any) -> bool:
+    return isinstance(value, tuple) and hasattr(value, "_fields")

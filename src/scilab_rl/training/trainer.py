@@ -1,0 +1,221 @@
+"""The course of a training run: epochs, evaluation, best policy, early stop.
+
+The algorithm's own `learn` stays in charge of learning; the trainer hangs into it as a callback, in
+Stable-Baselines3's convention, which our one-file algorithms follow too.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
+
+from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.errors import NumericalError
+from scilab_rl.metrics.criteria import is_better, should_stop_early
+from scilab_rl.metrics.logger import MetricLogger
+from scilab_rl.metrics.store import MetricStore
+from scilab_rl.seeding import derive_seed
+from scilab_rl.tracking.base import Tracker
+from scilab_rl.training import checkpoint
+from scilab_rl.training.evaluation import evaluate
+from scilab_rl.training.snapshot import capture, restore
+from scilab_rl.training.statistics import RolloutStatistics
+
+BEST, FINISHED = "rl_model_best", "rl_model_finished"
+_log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True)
+class TrainingPlan:
+    """The numbers of the configuration that shape a run.
+
+    Attributes:
+        eval_after_n_steps: Environment steps per epoch, over all environments.
+        n_epochs: Most epochs.
+        n_test_rollouts: Evaluation episodes after each epoch.
+        early_stop_data_column: Metric that may end the run.
+        early_stop_threshold: Value at which it does.
+        early_stop_last_n: Over how many epochs it is averaged.
+        seed: Seed of the run.
+    """
+
+    eval_after_n_steps: int
+    n_epochs: int
+    n_test_rollouts: int
+    early_stop_data_column: str
+    early_stop_threshold: float
+    early_stop_last_n: int
+    seed: int
+
+
+class Trainer(BaseCallback):
+    """Divides `learn` into epochs and does what belongs to the end of each.
+
+    Args:
+        plan: The numbers of the configuration.
+        eval_env: Environment for evaluation.
+        trackers: Told about each epoch and each training episode.
+        run_dir: Where policies are saved.
+
+    Attributes:
+        store: One row of metrics per epoch.
+        metric_logger: The logger that the algorithm records to.
+        stopped_early: Whether the early-stop rule ended the run.
+        before_evaluation: Called with the epoch's number before it is evaluated.
+    """
+
+    def __init__(
+        self, plan: TrainingPlan, eval_env: VecEnv, trackers: Tracker, run_dir: Path
+    ) -> None:
+        super().__init__()
+        self.plan = plan
+        self.eval_env = eval_env
+        self.trackers = trackers
+        self.run_dir = run_dir
+        self.store = MetricStore()
+        self.metric_logger = MetricLogger()
+        self.stopped_early = False
+        self.best: tuple[float, ...] | None = None
+        self.before_evaluation: list[Callable[[int], Any]] = []
+        self.statistics: RolloutStatistics | None = None
+        self._epoch_started = 0.0
+
+    def watch(self, model: Any, train_env: ObservedVecEnv) -> None:
+        """Attach to an algorithm and the environments it learns in."""
+        model.set_logger(self.metric_logger)
+        self.statistics = RolloutStatistics(
+            self.metric_logger, train_env.num_envs, self.trackers.episode
+        )
+        train_env.observers.append(self.statistics)
+
+    @property
+    def total_steps(self) -> int:
+        """Environment steps of all epochs together."""
+        return self.plan.eval_after_n_steps * self.plan.n_epochs
+
+    @property
+    def n_epochs_done(self) -> int:
+        """Completed epochs."""
+        return len(self.store)
+
+    def _on_training_start(self) -> None:
+        self._epoch_started = time.monotonic()
+        self._epoch_first_step = self.num_timesteps
+
+    def _on_step(self) -> bool:
+        self.trackers.step(self.num_timesteps)
+        if self.num_timesteps < (self.n_epochs_done + 1) * self.plan.eval_after_n_steps:
+            return True
+        self._end_epoch()
+        return not self.stopped_early and self.n_epochs_done < self.plan.n_epochs
+
+    def _end_epoch(self) -> None:
+        training_seconds = time.monotonic() - self._epoch_started
+        values = self._training_metrics(training_seconds)
+        values |= self._evaluate()
+        self._refuse_nan(values)
+        self.store.append(self.num_timesteps, values)
+        self._keep_if_best(values)
+        self.trackers.epoch(self.num_timesteps, self.n_epochs_done, values)
+        plan = self.plan
+        self.stopped_early = should_stop_early(
+            self.store.series(plan.early_stop_data_column),
+            plan.early_stop_threshold,
+            plan.early_stop_last_n,
+        )
+        self._epoch_started = time.monotonic()
+        self._epoch_first_step = self.num_timesteps
+
+    def _training_metrics(self, seconds: float) -> dict[str, float]:
+        assert self.statistics is not None
+        steps = self.num_timesteps - self._epoch_first_step
+        return {
+            **self.metric_logger.take(),
+            **self.statistics.metrics(),
+            "time/total_timesteps": float(self.num_timesteps),
+            "time/fps": steps / max(seconds, 1e-9),
+            "time/train_seconds": seconds,
+        }
+
+    def _evaluate(self) -> dict[str, float]:
+        started = time.monotonic()
+        train_env = self.model.get_env()
+        if train_env is not None and _has_normalization(train_env):
+            sync_envs_normalization(train_env, self.eval_env)
+        seed = derive_seed(self.plan.seed, "eval", self.n_epochs_done)
+        for prepare in self.before_evaluation:
+            prepare(self.n_epochs_done + 1)
+        evaluation = evaluate(self.model, self.eval_env, self.plan.n_test_rollouts, seed)
+        return evaluation.metrics() | {"time/eval_seconds": time.monotonic() - started}
+
+    def _refuse_nan(self, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            if name.startswith(("train/", "eval/")) and not math.isfinite(value):
+                raise NumericalError(
+                    f"{name} is {value} after {self.num_timesteps} steps "
+                    f"({_hyperparameters(self.model)}). Often the learning rate is too high."
+                )
+
+    def _keep_if_best(self, values: Mapping[str, float]) -> None:
+        candidate = (values.get("eval/success_rate", 0.0), values["eval/mean_reward"])
+        if is_better(candidate, self.best):
+            self.best = candidate
+            self.save_policy(BEST)
+
+    def save_policy(self, name: str) -> None:
+        """Save everything but the replay buffer under this name in the run directory."""
+        state = policy_state(self.model)
+        try:
+            checkpoint.save(
+                capture(state, with_buffers=False),
+                self.run_dir / name,
+                step=self.num_timesteps,
+                about={"epoch": self.n_epochs_done},
+            )
+        except OSError as error:
+            _log.warning("The policy %s could not be saved: %s. Training goes on.", name, error)
+
+
+def load_policy(model: Any, directory: Path) -> None:
+    """Put a saved policy, with its optimizers and normalisation, into an algorithm.
+
+    Raises:
+        CheckpointError: If the policy is damaged or was saved by another algorithm.
+    """
+    restore(policy_state(model), checkpoint.load(directory))
+
+
+def policy_state(model: Any) -> dict[str, Any]:
+    """Return the parts of a run that make a policy: the algorithm and its normalisation."""
+    state = {"algorithm": model}
+    if (normalization := find_normalization(model.get_env())) is not None:
+        state["obs_rms"] = normalization.obs_rms
+        state["ret_rms"] = normalization.ret_rms
+    return state
+
+
+def find_normalization(env: Any) -> VecNormalize | None:
+    """Return the normalising layer of a vector environment, if it has one."""
+    while env is not None:
+        if isinstance(env, VecNormalize):
+            return env
+        env = getattr(env, "venv", None)
+    return None
+
+
+def _has_normalization(env: VecEnv) -> bool:
+    return find_normalization(env) is not None
+
+
+def _hyperparameters(model: Any) -> str:
+    names = ("learning_rate", "gamma", "batch_size")
+    shown = {name: getattr(model, name) for name in names if hasattr(model, name)}
+    return ", ".join(f"{name}={value}" for name, value in shown.items())

@@ -1,0 +1,1 @@
+"""Frames and metrics, side by side."""
