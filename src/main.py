@@ -2,4 +2,5 @@
 
 from scilab_rl.cli import main
 
-main()
+if __name__ == "__main__":  # subprocess environments import this file again
+    main()

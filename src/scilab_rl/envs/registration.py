@@ -51,10 +51,14 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
     family, version = parsed["name"], parsed["version"]
     usable = _usable_versions(family)
     if not usable and name not in gym.registry:
-        raise ConfigError(f"No environment '{given}'.{_suggestion(name)} `scilab-rl envs` lists all.")
+        raise ConfigError(
+            f"No environment '{given}'.{_suggestion(name)} `scilab-rl envs` lists all."
+        )
     if version is not None and (int(version) in usable or not usable):
         return given, None
     newest = f"{family}-v{max(usable)}" if usable != [None] else family
+    if module:  # kept, so that other processes can import it too
+        newest = f"{module}:{newest}"
     if version is None:
         return newest, None
     return newest, f"{name} is not available any more; using {newest}."

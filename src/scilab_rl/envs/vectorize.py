@@ -65,7 +65,9 @@ def make_eval_env(settings: EnvSettings) -> VecEnv:
 def make_single_env(settings: EnvSettings) -> gym.Env:
     """Make one environment with its per-environment wrappers."""
     try:
-        env = gym.make(settings.env_id, render_mode=settings.render_mode, **settings.env_kwargs)
+        # An environment that draws nothing need not have the parameter.
+        rendering = {"render_mode": settings.render_mode} if settings.render_mode else {}
+        env = gym.make(settings.env_id, **rendering, **settings.env_kwargs)
         for wrapper in settings.wrappers:
             if not _wraps_vectors(wrapper):
                 env = wrapper(env)
@@ -128,6 +130,8 @@ def _keyword_arguments(env_id: str) -> list[str]:
     for cls in getattr(entry_point, "__mro__", [entry_point])[:2]:
         signature = inspect.signature(cls.__init__ if inspect.isclass(cls) else cls)  # type: ignore[arg-type,misc]
         parameters |= dict.fromkeys(
-            p.name for p in signature.parameters.values() if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)
+            p.name
+            for p in signature.parameters.values()
+            if p.kind in (p.KEYWORD_ONLY, p.POSITIONAL_OR_KEYWORD)
         )
     return [name for name in parameters if name not in ("self", "render_mode")]
