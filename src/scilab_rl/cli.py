@@ -1,4 +1,4 @@
-"""The command line: ``scilab-rl [KEY=VALUE ...]`` trains, ``scilab-rl COMMAND ...`` does the rest."""
+"""The command line: ``scilab-rl KEY=VALUE ...`` trains, ``scilab-rl COMMAND ...`` does the rest."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ COMMANDS = {
     "explain": "show where the value of a key comes from",
     "doctor": "check the installation and say how to repair it",
 }
-EXIT_INTERRUPTED = 130
+EXIT_INTERRUPTED, EXIT_PIPE_CLOSED = 130, 141
 # Parts of the configuration that are dictionaries: their keys can be added without Hydra's plus.
 _OPEN_GROUPS = ("algorithm.", "env_kwargs.")
 
@@ -54,7 +54,7 @@ def run_command_line(arguments: list[str]) -> int:
         return EXIT_INTERRUPTED
     except BrokenPipeError:  # the reader of our output has gone, as in `scilab-rl runs | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 141
+        return EXIT_PIPE_CLOSED
 
 
 def _dispatch(arguments: list[str]) -> int:
@@ -70,12 +70,21 @@ def _dispatch(arguments: list[str]) -> int:
 
         print_help(COMMANDS)
         return 0
-    if first and not first.startswith("-") and "=" not in first and first != "train":
+    if first and not first.startswith(("-", "~")) and "=" not in first and first != "train":
+        if first.lstrip("+") in config_keys():
+            raise ConfigError(f"{first} needs a value: {first}=VALUE.")
         raise ConfigError(
             f"There is no command '{first}'.{did_you_mean(first, COMMANDS)} "
             f"Commands: {', '.join(COMMANDS)}. To train, give KEY=VALUE, for example env=FetchPush."
         )
     return train(arguments[1:] if first == "train" else arguments)
+
+
+def config_keys() -> list[str]:
+    """Return the keys of the configuration."""
+    from scilab_rl.config import ALIASES, GROUPS, KEYS
+
+    return [*(key.name for key in KEYS), *GROUPS, *ALIASES]
 
 
 def train(arguments: list[str]) -> int:
@@ -88,33 +97,36 @@ def train(arguments: list[str]) -> int:
     from scilab_rl.config import compose, explain_error
     from scilab_rl.workspace import open_desk
 
-    outcome: dict[str, Any] = {}
+    results: list[Any] = []
+    errors: list[Exception] = []
 
     @hydra.main(version_base="1.3", config_path="pkg://scilab_rl.conf", config_name="main")
     def task(_: Any) -> float | None:
         from scilab_rl import experiment
 
         overrides = list(HydraConfig.get().overrides.task)
-        cfg = compose(overrides)
-        outcome["result"] = experiment.run(cfg, overrides)
-        return outcome["result"].score
+        try:
+            results.append(experiment.run(compose(overrides), overrides))
+        except Exception as error:  # noqa: BLE001 - reported below; the other runs of a sweep go on
+            errors.append(error)
+            return None
+        return results[-1].score
 
     open_desk()
     original, sys.argv = sys.argv, [sys.argv[0], *map(friendly_override, arguments)]
     try:
         task()
-    except (ScilabRLError, KeyboardInterrupt):
-        raise
     except Exception as error:
         raise explain_error(error) from error
     finally:
         sys.argv = original
-    result = outcome.get("result")
-    return EXIT_INTERRUPTED if result is not None and result.status == "interrupted" else 0
+    if errors:
+        raise errors[0] if isinstance(errors[0], ScilabRLError) else explain_error(errors[0])
+    return results[-1].exit_code if results else 0
 
 
 def friendly_override(argument: str) -> str:
-    """Add Hydra's ``++`` where a key of an open dictionary is set: it means the same and always works.
+    """Add Hydra's ``++`` where a key of an open dictionary is set: the same meaning, always valid.
 
     >>> friendly_override("algorithm.gamma=0.9")
     '++algorithm.gamma=0.9'

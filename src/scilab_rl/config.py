@@ -12,9 +12,12 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import hydra
+import hydra.utils
+import yaml
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -23,7 +26,14 @@ from scilab_rl.workspace import config_files
 
 _log = logging.getLogger(__name__)
 
-NUMBER, WHOLE, TEXT, SWITCH, MAPPING, LIST = "number", "whole number", "text", "switch", "mapping", "list"
+NUMBER, WHOLE, TEXT, SWITCH, MAPPING, LIST = (
+    "number",
+    "whole number",
+    "text",
+    "switch",
+    "mapping",
+    "list",
+)
 
 
 @dataclass(frozen=True)
@@ -49,11 +59,17 @@ class Key:
 
 KEYS = (
     Key("env", TEXT, "id of the environment; without version: the newest"),
-    Key("env_kwargs", MAPPING, "keyword arguments of the environment (+env_kwargs.reward_type=dense)"),
+    Key(
+        "env_kwargs",
+        MAPPING,
+        "keyword arguments of the environment (+env_kwargs.reward_type=dense)",
+    ),
     Key("wrappers", LIST, "wrappers around the environment, each with a _target_"),
     Key("n_envs", WHOLE, "training environments side by side", low=1),
     Key("vector", TEXT, "where they run", choices=("inprocess", "subprocess")),
-    Key("tuned", SWITCH, "use the tuned values for this algorithm and environment, if there are any"),
+    Key(
+        "tuned", SWITCH, "use the tuned values for this algorithm and environment, if there are any"
+    ),
     Key("seed", WHOLE, "seed of everything; 0 draws one and records it", low=0),
     Key("eval_after_n_steps", WHOLE, "environment steps per epoch", low=1),
     Key("n_epochs", WHOLE, "most epochs", low=1),
@@ -62,10 +78,21 @@ KEYS = (
     Key("early_stop_threshold", NUMBER, "value at which it does"),
     Key("early_stop_last_n", WHOLE, "over how many epochs it is averaged", low=1),
     Key("hyperopt_criterion", TEXT, "metric whose last value is the score of the run"),
-    Key("render", TEXT, "none, or record a video of an evaluation episode", choices=("none", "record")),
+    Key(
+        "render",
+        TEXT,
+        "none, or record a video of an evaluation episode",
+        choices=("none", "record"),
+    ),
     Key("render_freq", WHOLE, "epochs between rendered ones", low=1),
     Key("base_logdir", TEXT, "folder of all runs"),
     Key("restore_policy", TEXT, "folder of a saved policy to start from", optional=True),
+    Key(
+        "save_model_freq",
+        WHOLE,
+        "environment steps between checkpoints; 0: only when stopped",
+        low=0,
+    ),
     Key("info", TEXT, "a note to yourself, kept with the run"),
     Key("mlflow", SWITCH, "track with MLflow; auto: when it is installed", choices=("auto",)),
     Key("wandb", SWITCH, "track with Weights & Biases (offline without a key)"),
@@ -79,11 +106,22 @@ KEYS = (
 )
 GROUPS = ("algorithm", "tracking")
 
+# Packages that the configuration of an earlier run may name.
+_TRUSTED = (
+    "scilab_rl.", "custom_algorithms.", "custom_envs.", "custom_probes.",
+    "stable_baselines3.", "sb3_contrib.", "gymnasium.", "gymnasium_robotics.", "torch.nn.",
+)  # fmt: skip
 _FLATTEN = {"_target_": "gymnasium.wrappers.FlattenObservation"}
 _CLIP = {"_target_": "gymnasium.wrappers.ClipAction"}
 _TIME = {"_target_": "gymnasium.wrappers.TimeAwareObservation"}
 _NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
-ALIASES = ("clip_action", "time_aware_observation", "flatten_obs", "normalize_obs", "normalize_reward")
+ALIASES = (
+    "clip_action",
+    "time_aware_observation",
+    "flatten_obs",
+    "normalize_obs",
+    "normalize_reward",
+)
 
 _KNOWN_METRICS = (
     "eval/success_rate",
@@ -113,6 +151,57 @@ def compose(overrides: Sequence[str]) -> DictConfig:
         return hydra.compose("main", overrides=[f"+tuned_values={tuned}", *overrides])
     except Exception as error:
         raise explain_error(error) from error
+
+
+def load_recorded(path: Path, overrides: Sequence[str] = ()) -> DictConfig:
+    """Load the configuration of an earlier run, which is data: it may not name foreign code.
+
+    Args:
+        path: A ``config.yaml`` that a run has written.
+        overrides: ``key=value`` changes by the user.
+
+    Raises:
+        ConfigError: If it cannot be read, or names anything but algorithms, environments and
+            wrappers of the framework, its libraries and the desk.
+    """
+    try:
+        cfg = OmegaConf.load(path)
+        assert isinstance(cfg, DictConfig)
+        refuse_foreign_code(OmegaConf.to_container(cfg, resolve=False), path)
+        changes = OmegaConf.from_dotlist([override.lstrip("+") for override in overrides])
+        return OmegaConf.merge(cfg, changes)  # type: ignore[return-value]
+    except (OSError, AssertionError, ValueError, OmegaConfBaseException, yaml.YAMLError) as error:
+        raise explain_error(error) from error
+
+
+def refuse_foreign_code(value: Any, path: Path) -> None:
+    """Refuse interpolations and targets outside the framework, its libraries and the desk."""
+    if isinstance(value, Mapping):
+        for key, entry in value.items():
+            if key in ("_target_", "path", "replay_buffer_class") and isinstance(entry, str):
+                _refuse_foreign_class(entry, path)
+            refuse_foreign_code(entry, path)
+    elif isinstance(value, (list, tuple)):
+        for entry in value:
+            refuse_foreign_code(entry, path)
+    elif isinstance(value, str) and "${" in value:
+        raise ConfigError(f"'{path}' holds the interpolation {value!r}; recorded runs hold values.")
+
+
+def _refuse_foreign_class(target: str, path: Path) -> None:
+    if target in ("auto", "her", "hydra.utils.get_class"):
+        return
+    if target.startswith(_TRUSTED):
+        try:
+            found = hydra.utils.get_class(target)
+        except Exception as error:
+            raise ConfigError(f"'{path}' names '{target}', which cannot be found.") from error
+        if found.__module__.startswith(_TRUSTED):
+            return
+    raise ConfigError(
+        f"'{path}' names '{target}', which is no part of Scilab-RL, its libraries or your desk. "
+        "A recorded run is data and must not bring code with it."
+    )
 
 
 def tuned_option(cfg: DictConfig) -> str | None:
@@ -185,7 +274,9 @@ def explain_error(error: Exception) -> ConfigError:
         )
     mark = getattr(error, "problem_mark", None)
     if mark is not None:
-        return ConfigError(f"{mark.name}:{mark.line + 1}: {getattr(error, 'problem', None) or error}")
+        return ConfigError(
+            f"{mark.name}:{mark.line + 1}: {getattr(error, 'problem', None) or error}"
+        )
     unknown = re.search(r"Could not override '([^']+)'", str(error))
     if unknown:
         return _unknown_override(unknown[1])

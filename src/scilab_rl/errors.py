@@ -46,7 +46,7 @@ class NumericalError(AlgorithmError):
     """A NaN or an infinity appeared where a number has to be."""
 
 
-class EnvironmentError_(ScilabRLError):  # noqa: N801 - the built-in has the plain name
+class EnvironmentError_(ScilabRLError):
     """An environment failed or broke its contract."""
 
 

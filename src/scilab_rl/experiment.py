@@ -6,9 +6,11 @@ import contextlib
 import importlib
 import importlib.util
 import logging
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +25,7 @@ from scilab_rl.seeding import resolve_seed, seed_everything
 from scilab_rl.tracking.base import RunInfo, TrackerGroup
 from scilab_rl.tracking.files import FilesTracker
 from scilab_rl.tracking.mirror import Mirror
+from scilab_rl.workspace import DESK_ENVS, config_files
 
 _log = logging.getLogger(__name__)
 _FALLBACK_CRITERION = "eval/mean_reward"
@@ -46,10 +49,33 @@ def run(cfg: DictConfig, overrides: Sequence[str] = ()) -> RunResult:
     directory = RunDirectory.create(Path(cfg.base_logdir), cfg.env, cfg.algorithm.name, cfg.seed)
     try:
         with _log_file(directory / "train.log"):
-            return _run_in(directory, cfg, overrides)
+            session = build(cfg, directory)
+            files.write_text(directory / CONFIG_FILE, OmegaConf.to_yaml(cfg, resolve=True))
+            provenance.write(directory, overrides, session.eval_env.envs[0])
+            return session.learn()
     except ConfigError:
         directory.discard()
         raise
+
+
+def resume(cfg: DictConfig, directory: RunDirectory) -> RunResult:
+    """Continue an interrupted run as if nothing had happened.
+
+    Args:
+        cfg: The run's own configuration, perhaps with more epochs.
+        directory: The run.
+
+    Raises:
+        CheckpointError: If the run has no whole checkpoint.
+    """
+    from scilab_rl.training import resume as continuation
+
+    cfg = complete(cfg)
+    snapshot, step = continuation.load_latest(directory.path)
+    with _log_file(directory / "train.log"):
+        session = build(cfg, directory)
+        continuation.continue_from(snapshot, session.algorithm, session.trainer)
+        return session.learn(resumed_step=step)
 
 
 def complete(cfg: DictConfig) -> DictConfig:
@@ -69,55 +95,98 @@ def complete(cfg: DictConfig) -> DictConfig:
     return cfg
 
 
-def _run_in(directory: RunDirectory, cfg: DictConfig, overrides: Sequence[str]) -> RunResult:
-    from scilab_rl.envs.vectorize import observed_layer
-    from scilab_rl.training.trainer import FINISHED, Trainer
+@dataclass
+class Session:
+    """Everything that takes part in a run, built and not yet started."""
 
-    started = time.monotonic()
+    cfg: DictConfig
+    directory: RunDirectory
+    train_env: Any
+    eval_env: Any
+    algorithm: Any
+    trainer: Any
+    trackers: TrackerGroup
+
+    def learn(self, resumed_step: int | None = None) -> RunResult:
+        """Train to the end, to an early stop, to an interruption or to a failure.
+
+        Args:
+            resumed_step: The step of the checkpoint that the run continues from.
+        """
+        started = time.monotonic()
+        self.directory.write_result(RunResult("running", None, 0, 0, 0.0, str(self.directory)))
+        self.directory.publish_as_last(Path(self.cfg.base_logdir))
+        outcome: dict[str, Any] = {"status": "failed"}
+        self.trackers.begin(run_info(self.cfg, self.directory, self.trainer, resumed_step))
+        try:
+            self._learn_until_stopped(outcome, resumed_step or 0)
+        except Exception as error:
+            outcome["error"] = str(error) or type(error).__name__
+            files.write_text(self.directory / "error.log", traceback.format_exc())
+            if isinstance(error, ScilabRLError):
+                raise
+            raise ScilabRLError(
+                f"{type(error).__name__}: {error} (details in {self.directory / 'error.log'})"
+            ) from error
+        finally:
+            result = self._result(time.monotonic() - started, **outcome)
+            self.directory.write_result(result)
+            self.trackers.end(result)
+            self.train_env.close()
+            self.eval_env.close()
+        return result
+
+    def _learn_until_stopped(self, outcome: dict[str, Any], steps_done: int) -> None:
+        from scilab_rl.training.interruption import TrainingInterrupted, polite_stop
+        from scilab_rl.training.trainer import FINISHED
+
+        trainer = self.trainer
+        with polite_stop() as trainer.stop_request:
+            try:
+                self.algorithm.learn(
+                    trainer.total_steps - steps_done,
+                    callback=trainer,
+                    log_interval=None,
+                    reset_num_timesteps=steps_done == 0,
+                )
+                outcome["status"] = "stopped_early" if trainer.stopped_early else "finished"
+            except TrainingInterrupted as interruption:
+                outcome["status"] = "interrupted"
+                outcome["signal_number"] = interruption.signal_number
+        trainer.save_policy(FINISHED)
+
+    def _result(self, seconds: float, **outcome: Any) -> RunResult:
+        trainer = self.trainer
+        failed = outcome["status"] == "failed"
+        return RunResult(
+            score=None if failed else score(trainer.store, self.cfg),
+            epochs=trainer.n_epochs_done,
+            steps=self.algorithm.num_timesteps,
+            seconds=seconds,
+            run_dir=str(self.directory),
+            metrics=trainer.store.rows[-1] if trainer.store.rows else {},
+            **outcome,
+        )
+
+
+def build(cfg: DictConfig, directory: RunDirectory) -> Session:
+    """Make environments, algorithm, trackers and trainer.
+
+    Raises:
+        ConfigError: If they do not fit together.
+    """
+    from scilab_rl.envs.vectorize import observed_layer
+    from scilab_rl.training.trainer import Trainer
+
     prepare_torch(cfg)
     train_env, eval_env = make_environments(cfg)
     algorithm = make_algorithm(cfg, train_env)
     restore_policy(cfg, algorithm)
-    files.write_text(directory / CONFIG_FILE, OmegaConf.to_yaml(cfg, resolve=True))
-    provenance.write(directory, overrides, eval_env.envs[0])
-    directory.write_result(RunResult("running", None, 0, 0, 0.0, str(directory)))
-    directory.publish_as_last(Path(cfg.base_logdir))
-
     trackers = open_trackers(cfg)
     trainer = Trainer(training_plan(cfg), eval_env, trackers, directory.path)
     trainer.watch(algorithm, observed_layer(train_env))
     record_videos(cfg, trainer, directory)
-    trackers.begin(run_info(cfg, directory, trainer.total_steps))
-    status, error = "failed", None
-    try:
-        algorithm.learn(trainer.total_steps, callback=trainer, log_interval=None)
-        status = "stopped_early" if trainer.stopped_early else "finished"
-        trainer.save_policy(FINISHED)
-    except KeyboardInterrupt:
-        status = "interrupted"
-        trainer.save_policy(FINISHED)
-    except Exception as raised:
-        error = str(raised) or type(raised).__name__
-        files.write_text(directory / "error.log", traceback.format_exc())
-        if isinstance(raised, ScilabRLError):
-            raise
-        raise ScilabRLError(f"{type(raised).__name__}: {error} (see {directory / 'error.log'})") from raised
-    finally:
-        result = RunResult(
-            status=status,
-            score=None if status == "failed" else score(trainer.store, cfg),
-            epochs=trainer.n_epochs_done,
-            steps=trainer.num_timesteps,
-            seconds=time.monotonic() - started,
-            run_dir=str(directory),
-            metrics=trainer.store.rows[-1] if trainer.store.rows else {},
-            error=error,
-        )
-        directory.write_result(result)
-        trackers.end(result)
-        train_env.close()
-        eval_env.close()
-    return result
+    return Session(cfg, directory, train_env, eval_env, algorithm, trainer, trackers)
 
 
 def prepare_torch(cfg: DictConfig) -> None:
@@ -155,6 +224,7 @@ def env_settings(cfg: DictConfig) -> Any:
         n_envs=cfg.n_envs,
         vector=cfg.vector,
         seed=cfg.seed,
+        modules=[DESK_ENVS] if DESK_ENVS in sys.modules else [],
     )
 
 
@@ -168,7 +238,7 @@ def make_algorithm(cfg: DictConfig, train_env: Any) -> Any:
     from scilab_rl.algorithms.compatibility import check_pair
 
     cls = algorithm_class(cfg)
-    check_pair(cfg.algorithm.name, cls, cfg.env, train_env, _fitting_algorithms(train_env))
+    check_pair(cfg.algorithm.name, cls, cfg.env, train_env, lambda: _fitting_algorithms(train_env))
     arguments = hydra.utils.instantiate(_arguments(cfg), _convert_="all")
     buffer = arguments.get("replay_buffer_class")
     if isinstance(buffer, str) and buffer not in ("auto", "her"):
@@ -216,7 +286,9 @@ def training_plan(cfg: DictConfig) -> Any:
 
     from scilab_rl.training.trainer import TrainingPlan
 
-    return TrainingPlan(**{field.name: cfg[field.name] for field in dataclasses.fields(TrainingPlan)})
+    return TrainingPlan(
+        **{field.name: cfg[field.name] for field in dataclasses.fields(TrainingPlan)}
+    )
 
 
 def record_videos(cfg: DictConfig, trainer: Any, directory: RunDirectory) -> None:
@@ -235,7 +307,9 @@ def record_videos(cfg: DictConfig, trainer: Any, directory: RunDirectory) -> Non
     trainer.before_evaluation.append(film)
 
 
-def run_info(cfg: DictConfig, directory: RunDirectory, total_steps: int) -> RunInfo:
+def run_info(
+    cfg: DictConfig, directory: RunDirectory, trainer: Any, resumed_step: int | None
+) -> RunInfo:
     """Collect what trackers want to know."""
     return RunInfo(
         run_dir=directory.path,
@@ -243,7 +317,7 @@ def run_info(cfg: DictConfig, directory: RunDirectory, total_steps: int) -> RunI
         env=cfg.env,
         algorithm=cfg.algorithm.name,
         seed=cfg.seed,
-        total_steps=total_steps,
+        total_steps=trainer.total_steps,
         n_epochs=cfg.n_epochs,
         parameters=config.flat(cfg),
         project=cfg.project_name,
@@ -251,6 +325,7 @@ def run_info(cfg: DictConfig, directory: RunDirectory, total_steps: int) -> RunI
         group=cfg.group,
         tags=tuple(cfg.tags or ()),
         notes=cfg.info,
+        resumed_step=resumed_step,
     )
 
 
@@ -297,11 +372,10 @@ def _import_target(target: str, key: str) -> Any:
 def _fitting_algorithms(env: Any) -> list[str]:
     """Return the names of the algorithms whose class accepts these spaces."""
     from scilab_rl.algorithms.compatibility import check_pair
-    from scilab_rl.workspace import config_files
 
     fitting = []
     for name, path in config_files("algorithm").items():
-        target = OmegaConf.load(path).get("_target_", "")
+        target = OmegaConf.to_container(OmegaConf.load(path))["_target_"]  # type: ignore[index,call-overload]
         try:
             check_pair(name, _import_target(target, name), "", env)
         except ConfigError:

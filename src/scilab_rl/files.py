@@ -1,4 +1,4 @@
-"""Writing files so that a crash at any moment leaves the old content or the new, never half of it."""
+"""Writing files so that a crash at any moment leaves the old content or the new, never a half."""
 
 from __future__ import annotations
 

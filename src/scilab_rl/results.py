@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 import datetime as dt
 import json
+import os
 import re
 import secrets
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -18,6 +20,7 @@ from scilab_rl.errors import ConfigError, did_you_mean
 CONFIG_FILE = "config.yaml"
 RESULT_FILE = "result.json"
 LAST_LINK = "last"
+EXIT_REQUEUE = 75
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,6 +37,7 @@ class RunResult:
         run_dir: The directory of the run.
         metrics: The last value of each evaluation metric.
         error: One line that says why the run failed.
+        signal_number: The signal that interrupted the run, or 0.
     """
 
     status: str
@@ -44,6 +48,19 @@ class RunResult:
     run_dir: str
     metrics: dict[str, float] = dataclasses.field(default_factory=dict)
     error: str | None = None
+    signal_number: int = 0
+
+    @property
+    def exit_code(self) -> int:
+        """What the shell shall see: 0, or 128 and the signal that interrupted the run.
+
+        Under a job scheduler an interrupted run asks to be queued again (75, EX_TEMPFAIL).
+        """
+        if not self.signal_number:
+            return 0
+        if self.signal_number == signal.SIGTERM and "SLURM_JOB_ID" in os.environ:
+            return EXIT_REQUEUE
+        return 128 + self.signal_number
 
 
 class RunDirectory:

@@ -11,7 +11,7 @@ from scilab_rl.errors import ConfigError
 
 SHIPPED_CONF = Path(__file__).parent / "conf"
 DESK_CONF = Path("conf")
-DESK_PACKAGES = ("custom_envs", "custom_algorithms", "custom_probes")
+DESK_ENVS = "custom_envs"
 
 
 def open_desk() -> None:
@@ -24,9 +24,9 @@ def open_desk() -> None:
     if Path(source).is_dir() and source not in sys.path:
         sys.path.insert(0, source)
     refuse_duplicates()
-    if importlib.util.find_spec("custom_envs") is not None:
+    if importlib.util.find_spec(DESK_ENVS) is not None:
         try:
-            importlib.import_module("custom_envs")
+            importlib.import_module(DESK_ENVS)
         except Exception as error:
             raise ConfigError(
                 f"src/custom_envs cannot be imported: {type(error).__name__}: {error}"

@@ -75,7 +75,9 @@ def check_arguments(name: str, cls: Callable[..., Any], arguments: Mapping[str, 
 def _parameters(cls: Callable[..., Any]) -> Iterable[str]:
     signature = inspect.signature(cls)
     return [
-        p.name for p in signature.parameters.values() if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
+        p.name
+        for p in signature.parameters.values()
+        if p.kind not in (p.VAR_KEYWORD, p.VAR_POSITIONAL)
     ]
 
 
@@ -102,7 +104,12 @@ def _check_type(argument: str, value: Any, cls: Callable[..., Any]) -> None:
     parameter = inspect.signature(cls).parameters[argument]
     default, annotation = parameter.default, str(parameter.annotation)
     is_number = isinstance(default, (int, float)) and not isinstance(default, bool)
-    if is_number and isinstance(value, (str, list)) and "str" not in annotation and "tuple" not in annotation:
+    if (
+        is_number
+        and isinstance(value, (str, list))
+        and "str" not in annotation
+        and "tuple" not in annotation
+    ):
         raise ConfigError(f"algorithm.{argument} must be a number, but it is {value!r}.")
     if isinstance(default, bool) and not isinstance(value, bool) and value not in (0, 1):
         raise ConfigError(f"algorithm.{argument} must be true or false, but it is {value!r}.")

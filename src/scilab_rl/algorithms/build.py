@@ -55,7 +55,9 @@ def build_algorithm(
     try:
         return cls(**arguments)
     except (AssertionError, TypeError, ValueError) as error:
-        raise ConfigError(f"{getattr(cls, '__name__', cls)} refuses its arguments: {error}") from error
+        raise ConfigError(
+            f"{getattr(cls, '__name__', cls)} refuses its arguments: {error}"
+        ) from error
 
 
 def policy_name(env: VecEnv) -> str:
@@ -104,4 +106,6 @@ def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
 
 def _shaped_noise(noise: NormalActionNoise, env: VecEnv) -> NormalActionNoise:
     shape = env.action_space.shape
-    return NormalActionNoise(np.broadcast_to(noise._mu, shape), np.broadcast_to(noise._sigma, shape))
+    return NormalActionNoise(
+        np.broadcast_to(noise._mu, shape), np.broadcast_to(noise._sigma, shape)
+    )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from gymnasium import spaces
@@ -54,7 +54,9 @@ def is_image_space(space: spaces.Space) -> bool:
     return isinstance(space, spaces.Box) and len(space.shape) == 3 and space.dtype == "uint8"
 
 
-def check_pair(name: str, cls: type, env_id: str, env: Any, known: Iterable[str] = ()) -> None:
+def check_pair(
+    name: str, cls: type, env_id: str, env: Any, fitting: Callable[[], Iterable[str]] = tuple
+) -> None:
     """Refuse an algorithm and environment that cannot work together.
 
     Args:
@@ -62,36 +64,36 @@ def check_pair(name: str, cls: type, env_id: str, env: Any, known: Iterable[str]
         cls: Its class.
         env_id: The environment's id.
         env: Anything with ``observation_space`` and ``action_space``.
-        known: Names of the algorithms that work with this environment, for the message.
+        fitting: Returns the names of algorithms that work with this environment, for the message.
 
     Raises:
         ConfigError: With the algorithms that can.
     """
     allowed = supported_action_spaces(cls)
     action_space, observation_space = env.action_space, env.observation_space
-    instead = f" These can: {', '.join(known)}." if known else ""
     if allowed is not None and not isinstance(action_space, allowed):
         raise ConfigError(
             f"{name} needs {_names(allowed)} actions, but {env_id} has "
-            f"{type(action_space).__name__} actions.{instead}"
+            f"{type(action_space).__name__} actions. These can: {', '.join(fitting())}."
         )
     if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
-        raise ConfigError(f"{env_id} has unbounded actions; wrap it so that low and high are finite.")
+        raise ConfigError(
+            f"{env_id} has unbounded actions; wrap it so that low and high are finite."
+        )
     if isinstance(observation_space, spaces.Dict):
-        _check_dictionary(name, cls, env_id, observation_space, instead)
+        _check_dictionary(name, cls, env_id, observation_space)
     elif isinstance(observation_space, spaces.Tuple):
         raise ConfigError(
             f"{env_id} has Tuple observations, which no algorithm here reads; add +flatten_obs=1."
         )
 
 
-def _check_dictionary(name: str, cls: type, env_id: str, space: spaces.Dict, instead: str) -> None:
+def _check_dictionary(name: str, cls: type, env_id: str, space: spaces.Dict) -> None:
     if any(isinstance(entry, (spaces.Dict, spaces.Tuple)) for entry in space.spaces.values()):
         raise ConfigError(f"{env_id} has nested dictionaries as observations; add +flatten_obs=1.")
     if any(ancestor.__name__ in _NO_DICT_OBSERVATIONS for ancestor in cls.__mro__):
         raise ConfigError(
-            f"{name} reads plain vectors, but {env_id} has Dict observations; "
-            f"add +flatten_obs=1.{instead}"
+            f"{name} reads plain vectors, but {env_id} has Dict observations; add +flatten_obs=1."
         )
 
 

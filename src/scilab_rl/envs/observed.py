@@ -129,29 +129,31 @@ class ObservedVecEnv(VecEnvWrapper):
         return observations, rewards, dones, infos
 
     def state(self) -> dict[str, Any]:
-        """Return the counters, for a checkpoint."""
+        """Return counters and current observations, for a checkpoint."""
         return {
             "step_count": self.step_count,
             "episodes": self.episodes,
             "episode_steps": self.episode_steps,
+            "observations": self._observations,
         }
 
-    def continue_from(self, state: Mapping[str, Any], observations: Any) -> None:
-        """Take up the counters of a checkpoint and the observation it was made at."""
+    def continue_from(self, state: Mapping[str, Any]) -> None:
+        """Take up the counters and observations of a checkpoint."""
         self.step_count = state["step_count"]
         self.episodes = np.asarray(state["episodes"])
         self.episode_steps = np.asarray(state["episode_steps"])
-        self._observations = observations
+        self._observations = state["observations"]
 
     def _check_finite(self, values: Any, what: str) -> None:
         entries = values.items() if isinstance(values, dict) else [("", values)]
         for key, array in entries:
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
                 index = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+                last = None if self._actions is None else np.asarray(self._actions)[index[0]]
                 raise EnvironmentError_(
                     f"{self.name}: {what}{f' {key!r}' if key else ''} is {array[index]} at index "
-                    f"{index[1:]} of environment {index[0]} after step {self.step_count}; last "
-                    f"action {np.asarray(self._actions)[index[0]] if self._actions is not None else None}."
+                    f"{index[1:]} of environment {index[0]} after step {self.step_count}; "
+                    f"last action {last}."
                 )
 
     def _errors_named(self, call: str) -> _NamedErrors:
@@ -170,8 +172,8 @@ class _NamedErrors:
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
         if isinstance(error, Exception) and not isinstance(error, ScilabRLError):
             raise EnvironmentError_(
-                f"{self.env.name} raised {type(error).__name__} in {self.call}() at {self.env.phase} "
-                f"step {self.env.step_count}: {error}"
+                f"{self.env.name} raised {type(error).__name__} in {self.call}() at "
+                f"{self.env.phase} step {self.env.step_count}: {error}"
             ) from error
 
 

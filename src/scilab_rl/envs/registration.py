@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.util
 import re
@@ -24,7 +25,7 @@ SUITES: dict[str, tuple[str, tuple[str, ...]]] = {
 }
 _VERSIONED = re.compile(r"^(?P<name>.+?)(?:-v(?P<version>\d+))?$")
 # Entry points of ids that stay registered and can no longer be made.
-_ABANDONED = re.compile(r"MujocoPy|mujoco_py")
+_ABANDONED = re.compile(r"MujocoPy|mujoco_py|_raise_shimmy_error")
 
 
 def resolve_env_id(given: str) -> tuple[str, str | None]:
@@ -96,8 +97,23 @@ def _register_suite_of(name: str) -> None:
 
 
 def _register(package: str) -> None:
+    _drop_import_notice(package)
     module = importlib.import_module(package)
     gym.register_envs(module)
+
+
+def _drop_import_notice(package: str) -> None:
+    """Drop the notice about old Adroit rewards that Gymnasium-Robotics prints at each import.
+
+    It concerns ids that nobody here uses, and no logging level or warning filter reaches a print.
+    Its text comes from a table that can be imported before.
+    """
+    with contextlib.suppress(ImportError):
+        from farama_notifications import notifications
+
+        notices = notifications.get(package, {})
+        for version in [v for v, text in notices.items() if "Adroit" in text]:
+            del notices[version]
 
 
 def _import_user_module(module: str, given: str) -> None:

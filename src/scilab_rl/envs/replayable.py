@@ -12,7 +12,6 @@ import gymnasium as gym
 import numpy as np
 
 
-
 class ReplayableEpisode(gym.Wrapper):
     """Remembers what is needed to repeat the running episode; costs one list entry per step.
 

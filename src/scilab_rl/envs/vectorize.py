@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import inspect
 import os
 from collections.abc import Callable, Mapping, Sequence
@@ -10,10 +11,18 @@ from functools import partial
 from typing import Any
 
 import gymnasium as gym
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecEnvWrapper
+from gymnasium.envs.registration import load_env_creator
+from stable_baselines3.common.vec_env import (
+    DummyVecEnv,
+    SubprocVecEnv,
+    VecEnv,
+    VecEnvWrapper,
+    VecNormalize,
+)
 
 from scilab_rl.envs.frames import FrameCapture
 from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.envs.replayable import ReplayableEpisode
 from scilab_rl.errors import ConfigError, EnvironmentError_, did_you_mean
 from scilab_rl.seeding import derive_seed
@@ -33,6 +42,7 @@ class EnvSettings:
         n_envs: How many run side by side.
         vector: ``inprocess`` or ``subprocess``.
         seed: Seed of the run.
+        modules: Imported first, because they register environments.
         render_mode: ``rgb_array`` or ``human`` when frames are wanted.
     """
 
@@ -42,6 +52,7 @@ class EnvSettings:
     n_envs: int = 1
     vector: str = "inprocess"
     seed: int = 1
+    modules: Sequence[str] = ()
     render_mode: str | None = None
 
 
@@ -54,8 +65,8 @@ def make_eval_env(settings: EnvSettings) -> VecEnv:
     """Make the single environment for evaluation, with its own stream of seeds."""
     env = _make(replace(settings, n_envs=1, vector="inprocess"), "eval")
     layer: Any = env
-    while isinstance(layer, VecEnvWrapper):
-        if hasattr(layer, "norm_reward"):  # VecNormalize: measure, don't adapt; true rewards
+    while hasattr(layer, "venv"):
+        if isinstance(layer, VecNormalize):  # measure, don't adapt; true rewards
             layer.training = False
             layer.norm_reward = False
         layer = layer.venv
@@ -63,11 +74,14 @@ def make_eval_env(settings: EnvSettings) -> VecEnv:
 
 
 def make_single_env(settings: EnvSettings) -> gym.Env:
-    """Make one environment with its per-environment wrappers."""
+    """Make one environment with its per-environment wrappers; also called in worker processes."""
+    for module in settings.modules:
+        importlib.import_module(module)
+    resolve_env_id(settings.env_id)  # registers its suite
     try:
         # An environment that draws nothing need not have the parameter.
         rendering = {"render_mode": settings.render_mode} if settings.render_mode else {}
-        env = gym.make(settings.env_id, **rendering, **settings.env_kwargs)
+        env = gym.make(settings.env_id, **(rendering | dict(settings.env_kwargs)))
         for wrapper in settings.wrappers:
             if not _wraps_vectors(wrapper):
                 env = wrapper(env)
@@ -91,7 +105,7 @@ def observed_layer(env: VecEnv) -> ObservedVecEnv:
 
 
 def _make(settings: EnvSettings, phase: str) -> VecEnv:
-    makers = [partial(make_single_env, settings) for _ in range(settings.n_envs)]
+    makers: list[Callable[[], gym.Env]] = [partial(make_single_env, settings)] * settings.n_envs
     env: VecEnv
     if settings.vector == "subprocess" and settings.n_envs > 1:
         env = SubprocVecEnv(makers, start_method=os.environ.get("SCILAB_RL_START_METHOD"))
@@ -123,12 +137,12 @@ def _explain_type_error(settings: EnvSettings, error: TypeError) -> str:
 
 
 def _keyword_arguments(env_id: str) -> list[str]:
-    entry_point = gym.spec(env_id).entry_point
+    entry_point: Any = gym.spec(env_id).entry_point
     if isinstance(entry_point, str):
-        entry_point = gym.envs.registration.load_env_creator(entry_point)  # type: ignore[assignment]
+        entry_point = load_env_creator(entry_point)
     parameters: dict[str, None] = {}
     for cls in getattr(entry_point, "__mro__", [entry_point])[:2]:
-        signature = inspect.signature(cls.__init__ if inspect.isclass(cls) else cls)  # type: ignore[arg-type,misc]
+        signature = inspect.signature(cls.__init__ if inspect.isclass(cls) else cls)
         parameters |= dict.fromkeys(
             p.name
             for p in signature.parameters.values()

@@ -62,6 +62,20 @@ class MetricLogger:
         self._counts.clear()
         return values
 
+    def state(self) -> dict[str, dict[str, Any]]:
+        """Return what was recorded in the unfinished epoch, for a checkpoint."""
+        return {
+            "values": self.name_to_value,
+            "sums": dict(self._sums),
+            "counts": dict(self._counts),
+        }
+
+    def set_state(self, state: dict[str, dict[str, Any]]) -> None:
+        """Go on with an unfinished epoch."""
+        self.name_to_value = dict(state["values"])
+        self._sums = defaultdict(float, state["sums"])
+        self._counts = defaultdict(int, state["counts"])
+
     def dump(self, step: int = 0) -> None:
         """Do nothing: the framework decides when an epoch ends, not the algorithm."""
 

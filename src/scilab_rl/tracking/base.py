@@ -28,6 +28,7 @@ class RunInfo:
         group: Group of runs, or None.
         tags: Tags for remote trackers.
         notes: The user's ``info`` text.
+        resumed_step: Step at which an interrupted run goes on, or None for a new run.
     """
 
     run_dir: Path
@@ -43,6 +44,7 @@ class RunInfo:
     group: str | None = None
     tags: tuple[str, ...] = ()
     notes: str = ""
+    resumed_step: int | None = None
 
     @property
     def name(self) -> str:

@@ -53,7 +53,9 @@ class ConsoleTracker(Tracker):
                 console=self.console,
                 transient=True,
             )
-            self._task = self._progress.add_task("epoch 1", total=run.total_steps, speed="", result="")
+            self._task = self._progress.add_task(
+                "epoch 1", total=run.total_steps, speed="", result=""
+            )
             self._progress.start()
 
     def step(self, step: int) -> None:
@@ -100,7 +102,7 @@ def is_interactive() -> bool:
 
 
 def print_table(rows: list[tuple[str, str]], title: str | None = None) -> None:
-    """Print facts on standard output: a drawn table on a terminal, ``name: value`` lines elsewhere."""
+    """Print facts on standard output: a table on a terminal, ``name: value`` lines elsewhere."""
     if not (sys.stdout.isatty() and is_interactive()):
         for name, value in rows:
             sys.stdout.write(f"{name}: {value}\n")

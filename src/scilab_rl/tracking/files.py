@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import io
 import json
@@ -19,7 +20,7 @@ CSV, JSONL = "metrics.csv", "metrics.jsonl"
 
 
 class FilesTracker(Tracker):
-    """Writes ``metrics.csv``, one row per epoch, and ``metrics.jsonl``, one line per epoch or episode.
+    """Writes ``metrics.csv``, a row per epoch, and ``metrics.jsonl``, a line per epoch or episode.
 
     In ``metrics.csv`` the columns ``time/...`` come last: all others repeat exactly under a seed.
     """
@@ -33,6 +34,8 @@ class FilesTracker(Tracker):
     def begin(self, run: RunInfo) -> None:
         """Open the files for appending."""
         self._run_dir = run.run_dir
+        if run.resumed_step is not None:
+            self._go_back_to(run.resumed_step)
         self._jsonl = (run.run_dir / JSONL).open("a", encoding="utf-8", buffering=1)
 
     def episode(self, episode: Mapping[str, Any]) -> None:
@@ -51,6 +54,22 @@ class FilesTracker(Tracker):
         """Close the files."""
         if self._jsonl is not None:
             self._jsonl.close()
+
+    def _go_back_to(self, step: int) -> None:
+        """Drop what was written after a checkpoint: it will be measured again."""
+        path = self._run_dir / JSONL
+        lines = [line for line in _parsed_lines(path) if line["step"] <= step]
+        files.write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
+        self._rows = [
+            {key: value for key, value in line.items() if key != "kind"}
+            for line in lines
+            if line["kind"] == "epoch"
+        ]
+        self._columns = _ordered_columns([name for row in self._rows for name in row])
+        if self._rows:
+            files.write_text(self._run_dir / CSV, self._format(self._rows, header=True))
+        else:
+            (self._run_dir / CSV).unlink(missing_ok=True)
 
     def _write_line(self, line: Mapping[str, Any]) -> None:
         assert self._jsonl is not None
@@ -90,8 +109,19 @@ class _DiskErrors:
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
         if isinstance(error, OSError):
             raise ScilabRLError(
-                f"'{self.path}' cannot be written: {error.strerror} ({_free_space(self.path)} free)."
+                f"'{self.path}' cannot be written: {error.strerror} "
+                f"({_free_space(self.path)} free)."
             ) from error
+
+
+def _parsed_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the whole lines of a JSONL file; a killed run may have left half of the last one."""
+    lines = []
+    if path.is_file():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            with contextlib.suppress(ValueError):
+                lines.append(json.loads(line))
+    return lines
 
 
 def _free_space(path: Path) -> str:

@@ -35,6 +35,7 @@ class MLflowTracker(Tracker):
         """Create the run, or go on with it after a resume."""
         os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
         os.environ.setdefault("DO_NOT_TRACK", "true")
+        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
         from mlflow.tracking import MlflowClient
 
         uri = self.tracking_uri or f"sqlite:///{run.base_logdir.resolve() / 'mlflow.db'}"
@@ -83,7 +84,8 @@ class MLflowTracker(Tracker):
         from mlflow.entities import Param
 
         parameters = [
-            Param(name, str(value)[:_MAX_VALUE_CHARACTERS]) for name, value in run.parameters.items()
+            Param(name, str(value)[:_MAX_VALUE_CHARACTERS])
+            for name, value in run.parameters.items()
         ]
         for start in range(0, len(parameters), _MAX_PARAMETERS):
             self._client.log_batch(self._run_id, params=parameters[start : start + _MAX_PARAMETERS])

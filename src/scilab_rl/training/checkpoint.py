@@ -29,7 +29,9 @@ _TENSORS, _STATE, _ARRAYS = "tensors.safetensors", "state.json", "arrays"
 _VERSIONED = ("torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
 
 
-def save(snapshot: Snapshot, directory: Path, *, step: int, about: dict[str, Any] | None = None) -> None:
+def save(
+    snapshot: Snapshot, directory: Path, *, step: int, about: dict[str, Any] | None = None
+) -> None:
     """Write a snapshot; an existing one of the same name is replaced only by a complete one.
 
     Args:
@@ -89,7 +91,9 @@ def verify(directory: Path) -> dict[str, Any]:
         if not path.resolve().is_relative_to(directory.resolve()) or not path.is_file():
             raise CheckpointError(f"'{directory}' is damaged: {name} is missing.")
         if path.stat().st_size != expected["bytes"] or files.sha256(path) != expected["sha256"]:
-            raise CheckpointError(f"'{directory}' is damaged: {name} has changed since it was saved.")
+            raise CheckpointError(
+                f"'{directory}' is damaged: {name} has changed since it was saved."
+            )
     if {_TENSORS, _STATE} - set(manifest["files"]):
         raise CheckpointError(f"'{directory}' is damaged: its manifest lists no state.")
     return manifest
@@ -106,7 +110,10 @@ def _refuse_foreign_formats(directory: Path) -> None:
 
 
 def _write_content(snapshot: Snapshot, directory: Path) -> None:
-    tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in snapshot.tensors.items()}
+    tensors = {
+        name: tensor.detach().cpu().contiguous().clone()
+        for name, tensor in snapshot.tensors.items()
+    }
     save_file(tensors, directory / _TENSORS)
     names = {}
     for index, (name, array) in enumerate(snapshot.arrays.items()):

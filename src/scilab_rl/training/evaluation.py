@@ -50,7 +50,9 @@ class Evaluation:
         }
         if all(e.success is not None for e in self.episodes):
             values["success_rate"] = float(np.mean([bool(e.success) for e in self.episodes]))
-            values["success_once_rate"] = float(np.mean([bool(e.success_once) for e in self.episodes]))
+            values["success_once_rate"] = float(
+                np.mean([bool(e.success_once) for e in self.episodes])
+            )
         return {f"{prefix}/{name}": value for name, value in values.items()}
 
 

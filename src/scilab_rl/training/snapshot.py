@@ -149,8 +149,14 @@ class _Capture:
         return [
             (torch.nn.Module, self._module),
             (torch.optim.Optimizer, self._optimizer),
-            (np.random.Generator, lambda g, _: {"@kind": "generator", "state": g.bit_generator.state}),
-            (torch.Generator, lambda g, path: self._tensor(g.get_state(), path) | {"@kind": "torch_generator"}),
+            (
+                np.random.Generator,
+                lambda g, _: {"@kind": "generator", "state": g.bit_generator.state},
+            ),
+            (
+                torch.Generator,
+                lambda g, path: self._tensor(g.get_state(), path) | {"@kind": "torch_generator"},
+            ),
             (gym.Space, self._space),
             (BaseBuffer, self._buffer),
         ]
@@ -168,11 +174,15 @@ class _Capture:
     def _container(self, value: Any, path: str, rows: int | None) -> Node:
         if isinstance(value, dict):
             entries: Any = {
-                str(key): self.describe(entry, f"{path}.{key}", rows) for key, entry in value.items()
+                str(key): self.describe(entry, f"{path}.{key}", rows)
+                for key, entry in value.items()
             }
             return {"@kind": "dict", "entries": entries}
         entries = [self.describe(entry, f"{path}.{i}", rows) for i, entry in enumerate(value)]
-        return {"@kind": type(value).__name__ if not _is_named_tuple(value) else "skip", "entries": entries}
+        return {
+            "@kind": type(value).__name__ if not _is_named_tuple(value) else "skip",
+            "entries": entries,
+        }
 
     def _module(self, module: torch.nn.Module, path: str) -> Node:
         names = []

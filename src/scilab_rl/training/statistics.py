@@ -1,4 +1,4 @@
-"""Reward, success and length of training episodes, for every algorithm, from the environments alone."""
+"""Reward, success and length of training episodes: taken from the environments alone."""
 
 from __future__ import annotations
 
@@ -45,12 +45,12 @@ class RolloutStatistics:
 
     def metrics(self) -> dict[str, float]:
         """Return the means over the last 100 episodes, for those values that exist."""
-        windows = {
+        windows: dict[str, deque[Any]] = {
             "rollout/ep_rew_mean": self.episode_returns,
             "rollout/ep_len_mean": self.episode_lengths,
             "rollout/success_rate": self.episode_successes,
         }
-        return {name: float(np.mean(window)) for name, window in windows.items() if window}  # type: ignore[arg-type]
+        return {name: float(np.mean(window)) for name, window in windows.items() if window}
 
     def _finish(self, index: int, batch: StepBatch) -> None:
         episode: dict[str, Any] = {

@@ -24,9 +24,10 @@ from scilab_rl.metrics.logger import MetricLogger
 from scilab_rl.metrics.store import MetricStore
 from scilab_rl.seeding import derive_seed
 from scilab_rl.tracking.base import Tracker
-from scilab_rl.training import checkpoint
+from scilab_rl.training import checkpoint, resume
 from scilab_rl.training.evaluation import evaluate
-from scilab_rl.training.snapshot import capture, restore
+from scilab_rl.training.interruption import StopRequest, TrainingInterrupted
+from scilab_rl.training.snapshot import Snapshot, capture, restore
 from scilab_rl.training.statistics import RolloutStatistics
 
 BEST, FINISHED = "rl_model_best", "rl_model_finished"
@@ -44,6 +45,7 @@ class TrainingPlan:
         early_stop_data_column: Metric that may end the run.
         early_stop_threshold: Value at which it does.
         early_stop_last_n: Over how many epochs it is averaged.
+        save_model_freq: Environment steps between checkpoints; 0 saves none.
         seed: Seed of the run.
     """
 
@@ -53,6 +55,7 @@ class TrainingPlan:
     early_stop_data_column: str
     early_stop_threshold: float
     early_stop_last_n: int
+    save_model_freq: int
     seed: int
 
 
@@ -69,6 +72,7 @@ class Trainer(BaseCallback):
         store: One row of metrics per epoch.
         metric_logger: The logger that the algorithm records to.
         stopped_early: Whether the early-stop rule ended the run.
+        stop_request: Becomes true when somebody asks to stop.
         before_evaluation: Called with the epoch's number before it is evaluated.
     """
 
@@ -85,8 +89,13 @@ class Trainer(BaseCallback):
         self.stopped_early = False
         self.best: tuple[float, ...] | None = None
         self.before_evaluation: list[Callable[[int], Any]] = []
+        self.stop_request = StopRequest()
         self.statistics: RolloutStatistics | None = None
         self._epoch_started = 0.0
+        self._epoch_first_step = 0
+        self._next_checkpoint = plan.save_model_freq
+        self._boundary: tuple[int, Snapshot] | None = None
+        self._boundary_taken = 0.0
 
     def watch(self, model: Any, train_env: ObservedVecEnv) -> None:
         """Attach to an algorithm and the environments it learns in."""
@@ -109,9 +118,27 @@ class Trainer(BaseCallback):
     def _on_training_start(self) -> None:
         self._epoch_started = time.monotonic()
         self._epoch_first_step = self.num_timesteps
+        frequency = self.plan.save_model_freq
+        if frequency:
+            self._next_checkpoint = (self.num_timesteps // frequency + 1) * frequency
+
+    def _on_rollout_start(self) -> None:
+        """Save here, where nothing is pending."""
+        steps = self.model.num_timesteps
+        if self.stop_request:
+            self._stop(steps, resume.take(self.model, self))
+        if self.plan.save_model_freq and steps >= self._next_checkpoint:
+            self._next_checkpoint += self.plan.save_model_freq
+            self._save_checkpoint(steps, resume.take(self.model, self))
+        if self._rollouts_are_long() and time.monotonic() - self._boundary_taken > 1.0:
+            # A long rollout cannot be saved in its middle; a stop then goes back to its beginning.
+            self._boundary = steps, resume.frozen(resume.take(self.model, self))
+            self._boundary_taken = time.monotonic()
 
     def _on_step(self) -> bool:
         self.trackers.step(self.num_timesteps)
+        if self.stop_request and self._boundary is not None:
+            self._stop(*self._boundary)
         if self.num_timesteps < (self.n_epochs_done + 1) * self.plan.eval_after_n_steps:
             return True
         self._end_epoch()
@@ -169,6 +196,22 @@ class Trainer(BaseCallback):
         if is_better(candidate, self.best):
             self.best = candidate
             self.save_policy(BEST)
+
+    def _rollouts_are_long(self) -> bool:
+        return getattr(self.model, "replay_buffer", None) is None
+
+    def _save_checkpoint(self, step: int, snapshot: Snapshot) -> bool:
+        try:
+            resume.save(snapshot, self.run_dir, step)
+        except OSError as error:
+            _log.warning("No checkpoint at step %d: %s. Training goes on.", step, error)
+            return False
+        return True
+
+    def _stop(self, step: int, snapshot: Snapshot) -> None:
+        if self._save_checkpoint(step, snapshot):
+            _log.info("Stopped at step %d. Resume with: scilab-rl resume %s", step, self.run_dir)
+        raise TrainingInterrupted(self.stop_request.signal_number)
 
     def save_policy(self, name: str) -> None:
         """Save everything but the replay buffer under this name in the run directory."""

@@ -1,0 +1,152 @@
+"""``scilab-rl play RUN``: let a trained policy act, film it, and measure its success."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scilab_rl.config import load_recorded
+from scilab_rl.errors import ConfigError, RenderingError
+from scilab_rl.results import CONFIG_FILE, RunDirectory, find_run
+from scilab_rl.workspace import open_desk
+
+_log = logging.getLogger(__name__)
+_SMALL_BUFFER = 1000  # a policy that only acts needs no replay buffer
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command and return its exit code."""
+    options = _parse(arguments)
+    open_desk()
+    run = find_run(options.run, options.base_logdir)
+    cfg = load_recorded(run / CONFIG_FILE)
+    seed = options.seed or int(cfg.seed) + 1
+    env, model = load_player(cfg, policy_folder(run, options), record=options.record)
+    video = film_first_episode(env, run) if options.record else None
+    evaluation = _play(model, env, options, seed)
+    env.close()
+    _report(evaluation, cfg, video)
+    return 0
+
+
+def policy_folder(run: RunDirectory, options: argparse.Namespace) -> Path:
+    """Return the saved policy that was asked for, or the best one there is.
+
+    Raises:
+        ConfigError: If the run has saved none.
+    """
+    if (Path(options.run) / "manifest.json").is_file():
+        return Path(options.run)
+    names = [f"rl_model_{options.policy}", "rl_model_best", "rl_model_finished"]
+    for name in names:
+        if (run / name).is_dir():
+            return run / name
+    raise ConfigError(f"The run '{run}' has not saved a policy yet: it needs one epoch.")
+
+
+def load_player(cfg: Any, folder: Path, *, record: bool) -> tuple[Any, Any]:
+    """Make the evaluation environment of a run and the algorithm with its saved weights."""
+    from scilab_rl import experiment
+    from scilab_rl.envs.vectorize import make_eval_env
+    from scilab_rl.training.trainer import load_policy
+
+    cfg = experiment.complete(cfg)
+    experiment.prepare_torch(cfg)
+    settings = experiment.env_settings(cfg)
+    env = make_eval_env(replace(settings, render_mode=_render_mode() if record else None))
+    if "buffer_size" in cfg.algorithm:
+        cfg.algorithm.buffer_size = min(cfg.algorithm.buffer_size, _SMALL_BUFFER)
+    model = experiment.make_algorithm(cfg, env)
+    load_policy(model, folder)
+    return env, model
+
+
+def film_first_episode(env: Any, run: RunDirectory) -> Path:
+    """Prepare the video of the next episode and return where it will be."""
+    from scilab_rl.envs.vectorize import observed_layer
+    from scilab_rl.visualization.recorder import EpisodeRecorder
+
+    folder = run / "videos"
+    folder.mkdir(exist_ok=True)
+    path = folder / f"play_{len(list(folder.glob('play_*.mp4'))) + 1:03d}.mp4"
+    EpisodeRecorder(observed_layer(env)).arm(path)
+    return path
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(
+        prog="scilab-rl play",
+        description="Let a trained policy act and report its success rate with a 95 % interval.",
+    )
+    parser.add_argument("run", help="'last', the path of a run or policy, or a part of its name")
+    parser.add_argument("--episodes", type=_positive, default=10, help="how many (default 10)")
+    parser.add_argument("--record", action="store_true", help="film the first episode")
+    parser.add_argument("--policy", choices=("best", "finished"), default="best")
+    parser.add_argument("--stochastic", action="store_true", help="sample actions")
+    parser.add_argument("--seed", type=int, default=0, help="default: the run's seed plus 1")
+    parser.add_argument("--base-logdir", type=Path, default=Path("data"))
+    return parser.parse_args(arguments)
+
+
+def _positive(text: str) -> int:
+    number = int(text)
+    if number < 1:
+        raise argparse.ArgumentTypeError(f"must be at least 1, but it is {number}")
+    return number
+
+
+def _render_mode() -> str | None:
+    """Return ``rgb_array``, or None with a notice when no picture can be drawn."""
+    from scilab_rl.visualization.gl import choose_backend
+
+    try:
+        choose_backend()
+    except RenderingError as error:
+        _log.warning("%s Playing without pictures.", error)
+        return None
+    return "rgb_array"
+
+
+def _play(model: Any, env: Any, options: argparse.Namespace, seed: int) -> Any:
+    from scilab_rl.training.evaluation import evaluate
+
+    def show(episode: Any) -> None:
+        outcome = {None: "", True: "  success", False: "  no success"}[episode.success]
+        _log.info("%3d steps  return %.3g%s", len(episode.rewards), sum(episode.rewards), outcome)
+
+    return evaluate(
+        model,
+        env,
+        options.episodes,
+        seed,
+        deterministic=not options.stochastic,
+        on_episode=show,
+    )
+
+
+def _report(evaluation: Any, cfg: Any, video: Path | None) -> None:
+    from scilab_rl.tracking.console import print_table
+    from scilab_rl.training.evaluation import wilson_interval
+
+    episodes = evaluation.episodes
+    returns = [sum(episode.rewards) for episode in episodes]
+    rows = [("environment", cfg.env), ("algorithm", cfg.algorithm.name)]
+    rows.append(("episodes", str(len(episodes))))
+    if all(episode.success is not None for episode in episodes):
+        successes = sum(bool(episode.success) for episode in episodes)
+        low, high = wilson_interval(successes, len(episodes))
+        rate = successes / len(episodes)
+        rows.append(("success", f"{rate:.2f} (95 % interval {low:.2f} to {high:.2f})"))
+    rows.append(
+        ("return", f"{np.mean(returns):.3g} (from {min(returns):.3g} to {max(returns):.3g})")
+    )
+    if video is not None and video.is_file():
+        rows.append(("video", str(video)))
+    sys.stdout.flush()
+    print_table(rows)

@@ -1,0 +1,179 @@
+"""The complete state of a training run, and how it goes on from there as if nothing had happened.
+
+The state is taken where an algorithm begins a rollout: the last transition is stored, the last
+update is done, nothing is pending. Simulators are not saved but retold, see `envs.replayable`.
+"""
+
+from __future__ import annotations
+
+import copy
+import logging
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from stable_baselines3.common.vec_env import VecEnv
+
+from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.vectorize import observed_layer
+from scilab_rl.errors import CheckpointError
+from scilab_rl.files import point_to
+from scilab_rl.training import checkpoint
+from scilab_rl.training.snapshot import Snapshot, capture, random_state, restore, set_random_state
+
+FOLDER, LAST = "checkpoints", "last"
+GENERATIONS = 2
+_log = logging.getLogger(__name__)
+
+
+def training_state(model: Any, trainer: Any) -> dict[str, Any]:
+    """Return everything that the rest of the run depends on, name to object.
+
+    Args:
+        model: The algorithm.
+        trainer: The `Trainer` that watches it.
+    """
+    env = observed_layer(model.get_env())
+    return {
+        "algorithm": model,
+        "normalization": _normalization_layers(model.get_env()),
+        "environments": env.env_method("episode_state"),
+        "observed": env.state(),
+        "statistics": trainer.statistics,
+        "recorded": trainer.metric_logger.state(),
+        "history": {"steps": trainer.store.steps, "rows": trainer.store.rows},
+        "best": trainer.best,
+        "random": random_state(),
+    }
+
+
+def take(model: Any, trainer: Any) -> Snapshot:
+    """Capture the state; tensors and arrays are views that later steps change."""
+    return capture(training_state(model, trainer))
+
+
+def frozen(snapshot: Snapshot) -> Snapshot:
+    """Return a copy that later steps do not change."""
+    return Snapshot(
+        copy.deepcopy(snapshot.tree),
+        {name: tensor.clone() for name, tensor in snapshot.tensors.items()},
+        {name: array.copy() for name, array in snapshot.arrays.items()},
+    )
+
+
+def continue_from(snapshot: Snapshot, model: Any, trainer: Any) -> None:
+    """Bring a freshly built run to the state of a snapshot.
+
+    Raises:
+        CheckpointError: If the snapshot is of another algorithm or environment.
+    """
+    state = training_state(model, trainer)
+    # What has no counterpart in a fresh run is rebuilt from the description alone.
+    for name in ("environments", "observed", "recorded", "random", "best"):
+        state[name] = None
+    restored = restore(state, snapshot)
+    trainer.best = tuple(restored["best"]) if restored["best"] is not None else None
+    trainer.metric_logger.set_state(restored["recorded"])
+    env = observed_layer(model.get_env())
+    if not _retell_episodes(env, restored["environments"], restored["observed"]):
+        _begin_new_episodes(model)
+    # Retelling draws no numbers from the global generators; they come last to be sure.
+    set_random_state(restored["random"])
+
+
+def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
+    """Write a checkpoint, keep the newest two, and let ``last`` point to it.
+
+    Returns:
+        The checkpoint's directory.
+    """
+    folder = run_dir / FOLDER
+    folder.mkdir(exist_ok=True)
+    directory = folder / f"step_{step:010d}"
+    checkpoint.save(snapshot, directory, step=step)
+    point_to(folder / LAST, directory)
+    for old in _generations(run_dir)[GENERATIONS:]:
+        shutil.rmtree(old, ignore_errors=True)
+    return directory
+
+
+def load_latest(run_dir: Path) -> tuple[Snapshot, int]:
+    """Load the newest checkpoint that is whole, and its step.
+
+    Raises:
+        CheckpointError: If there is none.
+    """
+    damaged = []
+    for directory in _generations(run_dir):
+        try:
+            snapshot, step = checkpoint.load(directory), checkpoint.verify(directory)["step"]
+        except CheckpointError as error:
+            damaged.append(str(error))
+            continue
+        if damaged:
+            _log.warning("%s Using the older %s.", " ".join(damaged), directory.name)
+        return snapshot, step
+    raise CheckpointError(
+        " ".join(damaged)
+        or f"'{run_dir}' has no checkpoint. Runs keep one with save_model_freq=N, and when "
+        "they are stopped with Ctrl-C."
+    )
+
+
+def _generations(run_dir: Path) -> list[Path]:
+    """Return the checkpoints, newest first."""
+    return sorted((run_dir / FOLDER).glob("step_*[0-9]"), reverse=True)
+
+
+def _normalization_layers(env: Any) -> list[Any]:
+    layers = []
+    while isinstance(env, VecEnv) and hasattr(env, "venv"):
+        if hasattr(env, "obs_rms"):
+            names = ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward")
+            layers.append({name: getattr(env, name, None) for name in names})
+        env = env.venv
+    return layers
+
+
+def _retell_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[str, Any]) -> bool:
+    """Bring each environment to its place; False when one does not repeat itself exactly."""
+    repeated = [
+        env.env_method("replay_episode", episode, indices=index)[0]
+        for index, episode in enumerate(episodes)
+    ]
+    expected = observed["observations"]
+    for index, observation in enumerate(repeated):
+        if not _equal(observation, _entry(expected, index)):
+            _log.warning(
+                "%s does not repeat an episode exactly; a new one is begun, so the rest of the run "
+                "differs from the uninterrupted one.",
+                env.name,
+            )
+            return False
+    env.continue_from(observed)
+    return True
+
+
+def _begin_new_episodes(model: Any) -> None:
+    env = model.get_env()
+    model._last_obs = env.reset()
+    if hasattr(model, "_last_episode_starts"):
+        model._last_episode_starts = np.ones(env.num_envs, dtype=bool)
+    truncate = getattr(getattr(model, "replay_buffer", None), "truncate_last_trajectory", None)
+    if truncate is not None:
+        truncate()
+
+
+def _entry(observations: Any, index: int) -> Any:
+    if isinstance(observations, dict):
+        return {key: value[index] for key, value in observations.items()}
+    return observations[index]
+
+
+def _equal(one: Any, other: Any) -> bool:
+    if isinstance(one, dict):
+        return set(one) == set(other) and all(_equal(one[key], other[key]) for key in one)
+    # A vector environment stores observations in the type of the space.
+    other = np.asarray(other)
+    return bool(np.array_equal(np.asarray(one).astype(other.dtype), other))
