@@ -1,0 +1,122 @@
+"""``scilab-rl --help``: all commands, keys and flags. Imports nothing heavy: it must be instant."""
+
+from __future__ import annotations
+
+import math
+import re
+import shutil
+import sys
+import textwrap
+from collections.abc import Iterable, Mapping
+
+from omegaconf import DictConfig, OmegaConf
+
+from scilab_rl.commands.tables import write
+from scilab_rl.config import ALIASES, KEYS, SWITCH, Key
+from scilab_rl.workspace import SHIPPED_CONF, config_files
+
+_MAIN = SHIPPED_CONF / "main.yaml"
+_EXAMPLES = (
+    ("scilab-rl", "train with the defaults"),
+    ("scilab-rl algorithm=sac env=FetchPush n_epochs=20 seed=1", "change keys"),
+    (
+        "scilab-rl ++algorithm.learning_rate=0.001 +env_kwargs.reward_type=dense",
+        "... and nested ones",
+    ),
+    ("scilab-rl seed=1,2,3 --multirun", "one run for each value"),
+)
+_FLAGS = (
+    ("--multirun, -m", "run all combinations of the values that are separated by commas"),
+    ("--cfg job", "show the configuration and do not run"),
+    ("--debug", "show the full traceback of an error"),
+    ("--version", "show the version"),
+    ("--help, -h", "show this; `scilab-rl COMMAND --help` shows the options of a command"),
+)
+_WIDEST, _LEFT = 100, 32
+
+
+def print_help(commands: Mapping[str, str]) -> None:
+    """Print the help of the command line.
+
+    Args:
+        commands: The sub-commands and what each does.
+    """
+    width = min(_WIDEST, shutil.get_terminal_size((_WIDEST, 24)).columns)
+    for line in _lines(commands, width):
+        write(line)
+    sys.stdout.flush()
+
+
+def _lines(commands: Mapping[str, str], width: int) -> Iterable[str]:
+    yield from textwrap.wrap("Train robots and other agents by reinforcement learning.", width)
+    yield from _section(
+        "Usage: scilab-rl [KEY=VALUE ...] or scilab-rl COMMAND ...", _EXAMPLES, width
+    )
+    yield from _section("Commands", commands.items(), width)
+    yield from _section("Flags", _FLAGS, width)
+    main = OmegaConf.load(_MAIN)
+    assert isinstance(main, DictConfig)
+    yield from _section("Groups: a file each, of ours or in conf/", _groups(main), width)
+    for heading, names in _headings().items():
+        keys = [key for key in KEYS if key.name in names]
+        facts = [(f"{key.name}={_yaml(main[key.name])}", _meaning(key)) for key in keys]
+        yield from _section(heading, facts, width)
+    wrappers = [(f"+{alias}=1", "") for alias in ALIASES]
+    yield from _section("Wrappers around the environment", wrappers, width)
+
+
+def _section(title: str, facts: Iterable[tuple[str, str]], width: int) -> Iterable[str]:
+    yield ""
+    yield from textwrap.wrap(title, width)
+    for name, meaning in facts:
+        yield from _fact(name, meaning, width)
+
+
+def _fact(name: str, meaning: str, width: int) -> list[str]:
+    """Return ``name`` and its meaning: side by side, or below where there is no room."""
+    beside = width >= 2 * _LEFT
+    indent = " " * (_LEFT if beside else 6)
+    described = textwrap.wrap(meaning, width, initial_indent=indent, subsequent_indent=indent)
+    if beside and described and len(name) + 4 <= _LEFT:
+        return [f"  {name}".ljust(_LEFT) + described[0].lstrip(), *described[1:]]
+    return [f"  {name}", *described]
+
+
+def _groups(main: DictConfig) -> Iterable[tuple[str, str]]:
+    chosen = next(entry.algorithm for entry in main.defaults if "algorithm" in entry)
+    yield f"algorithm={chosen}", f"what learns: {', '.join(config_files('algorithm'))}"
+    experiments = ", ".join(config_files("performance")) or "none yet"
+    yield "+performance=FILE", f"the settings of an experiment: {experiments}"
+
+
+def _headings() -> dict[str, list[str]]:
+    """Return the headings of ``main.yaml``, which are its comments, and the keys below each."""
+    known, comment = {key.name for key in KEYS}, ""
+    headings: dict[str, list[str]] = {}
+    for line in _MAIN.read_text(encoding="utf-8").splitlines():
+        name = re.match(r"\w*(?=:)", line)
+        if line.startswith("# "):
+            comment = line[2:]
+        elif name and name[0] in known:
+            headings.setdefault(comment, []).append(name[0])
+    return headings
+
+
+def _yaml(value: object) -> str:
+    """Return a default as the user would type it."""
+    if value is None:
+        return "null"
+    return (
+        repr(value)
+        if value == ""
+        else str(value).lower()
+        if isinstance(value, bool)
+        else str(value)
+    )
+
+
+def _meaning(key: Key) -> str:
+    kinds = ("0", "1") if key.kind == SWITCH else () if key.choices else (key.kind,)
+    allowed = [*kinds, *map(str, key.choices)]
+    least = f" from {key.low:g}" if key.low > -math.inf else ""
+    return f"{key.meaning} ({' | '.join(allowed)}{least}{' | null' if key.optional else ''})"
