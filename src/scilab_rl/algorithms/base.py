@@ -1,0 +1,466 @@
+"""What every one-file algorithm needs around its learning: environments, callbacks, `predict`.
+
+None of the learning is here, and none of this is in an algorithm's file. The interface is that of
+Stable-Baselines3, so that its callbacks, replay buffers and vector environments work unchanged.
+"""
+
+from __future__ import annotations
+
+import warnings
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from gymnasium import spaces
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
+from stable_baselines3.common.utils import (
+    get_device,
+    is_vectorized_observation,
+    set_random_seed,
+)
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
+from stable_baselines3.her import HerReplayBuffer
+
+from scilab_rl.errors import ConfigError, NumericalError
+from scilab_rl.metrics.logger import MetricLogger
+
+Observation = np.ndarray | dict[str, np.ndarray]
+Self = TypeVar("Self", bound="OneFileAlgorithm")
+
+
+class Step(NamedTuple):
+    """One step of all environments.
+
+    Attributes:
+        observations: What the agent acted on. Shapes: ``(n_envs, ...)`` per entry.
+        next_observations: Where it led; the last observation of an episode that ended, not the
+            first one of the next episode. Shapes: ``(n_envs, ...)`` per entry.
+        rewards: Shapes: ``(n_envs,)``.
+        dones: Whether the episode ended, for whatever reason. Shapes: ``(n_envs,)``.
+        terminated: Whether it ended in a terminal state, which has no future. Where an episode
+            was only cut off (truncated), the value of the next state still counts.
+            Shapes: ``(n_envs,)``.
+        infos: One dictionary per environment.
+    """
+
+    observations: Observation
+    next_observations: Observation
+    rewards: np.ndarray
+    dones: np.ndarray
+    terminated: np.ndarray
+    infos: list[dict[str, Any]]
+
+
+class OneFileAlgorithm(ABC):
+    """The plumbing of an algorithm; a subclass adds `iterate` and `act`.
+
+    All state lies in attributes, and nothing is pending when ``callback.on_rollout_start`` is
+    called: that is where a checkpoint is taken, and from where it continues exactly.
+
+    Args:
+        env: Vector environment to learn in.
+        seed: Seed of the weights, the exploration and the environments; None: do not seed.
+        device: ``auto``, ``cpu``, ``cuda``, ...
+
+    Attributes:
+        supported_action_spaces: What kinds of actions the algorithm can choose.
+        num_timesteps: Environment steps so far, over all environments.
+        n_updates: Gradient steps so far.
+        logger: Takes metrics: ``self.logger.record("train/critic_loss", loss)``.
+        replay_buffer: Set by `make_replay_buffer`.
+    """
+
+    supported_action_spaces: ClassVar[tuple[type[spaces.Space], ...]]
+
+    def __init__(self, *, env: VecEnv, seed: int | None = None, device: str = "auto") -> None:
+        self.env = env
+        self.n_envs = env.num_envs
+        self.observation_space = env.observation_space
+        self.action_space = env.action_space
+        if not isinstance(self.action_space, self.supported_action_spaces):
+            allowed = " or ".join(kind.__name__ for kind in self.supported_action_spaces)
+            raise ConfigError(
+                f"{type(self).__name__} needs {allowed} actions, but the environment has "
+                f"{type(self.action_space).__name__} actions."
+            )
+        self.device = get_device(device)
+        self.seed = seed
+        self.logger: Any = MetricLogger()
+        self.num_timesteps = 0
+        self.n_updates = 0
+        self.replay_buffer: ReplayBuffer | None = None
+        self._total_timesteps = 0
+        self._last_obs: Any = None
+        # Replay buffers store what the environment gave before VecNormalize changed it.
+        self._last_original_obs: Any = None
+        self._vec_normalize_env = unwrap_vec_normalize(env)
+        if seed is not None:
+            set_random_seed(seed, using_cuda=self.device.type == "cuda")
+            self.action_space.seed(seed)
+            env.seed(seed)
+
+    @abstractmethod
+    def iterate(self, callback: BaseCallback) -> bool:
+        """Collect experience, then learn from it.
+
+        Args:
+            callback: ``on_rollout_start`` and ``on_rollout_end`` surround the collecting.
+
+        Returns:
+            False when the callback wants to stop.
+        """
+
+    @abstractmethod
+    def act(self, observations: torch.Tensor, deterministic: bool) -> torch.Tensor:
+        """Choose actions, in the units in which the algorithm learns.
+
+        Shapes:
+            observations: ``(batch, n_observations)``; result: what `to_env_actions` understands.
+        """
+
+    def learn(
+        self: Self,
+        total_timesteps: int,
+        callback: Any = None,
+        log_interval: int | None = None,
+        reset_num_timesteps: bool = True,
+    ) -> Self:
+        """Learn for a number of environment steps.
+
+        Args:
+            total_timesteps: Steps over all environments.
+            callback: A callback of Stable-Baselines3, a list of them, a function or None.
+            log_interval: Accepted for Stable-Baselines3, ignored: the framework logs.
+            reset_num_timesteps: False continues where an earlier call, or a checkpoint, ended.
+        """
+        callback = self._begin(total_timesteps, callback, reset_num_timesteps)
+        callback.on_training_start(locals(), globals())
+        while self.num_timesteps < self._total_timesteps and self.iterate(callback):
+            pass
+        callback.on_training_end()
+        return self
+
+    def predict(
+        self,
+        observation: Observation,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, Any]:
+        """Choose actions for observations as the environment gives them.
+
+        Args:
+            observation: One observation or a batch of them.
+            state: Returned unchanged; the policies here have no memory.
+            episode_start: Ignored, as above.
+            deterministic: Whether the most likely action is taken.
+
+        Returns:
+            Actions in the environment's bounds, batched if the observations are, and ``state``.
+        """
+        is_batch = is_vectorized_observation(observation, self.observation_space)  # type: ignore[arg-type]
+        if not is_batch:
+            observation = _batch_of_one(observation)
+        with torch.no_grad():
+            actions = self.to_env_actions(self.act(self.to_vector(observation), deterministic))
+        return (actions if is_batch else actions[0]), state
+
+    def set_logger(self, logger: Any) -> None:
+        """Let metrics be recorded by this logger."""
+        self.logger = logger
+
+    def get_env(self) -> VecEnv:
+        """Return the environment that the algorithm learns in."""
+        return self.env
+
+    def step(self, actions: np.ndarray, callback: BaseCallback) -> Step | None:
+        """Act in all environments and tell the callback.
+
+        Args:
+            actions: In the environment's bounds. Shapes: ``(n_envs, ...)``.
+            callback: Its ``on_step`` is called.
+
+        Returns:
+            What happened, or None when the callback wants to stop.
+        """
+        new_obs: Any
+        new_obs, rewards, dones, infos = self.env.step(actions)
+        self.num_timesteps += self.n_envs
+        callback.update_locals(
+            {
+                "actions": actions,
+                "new_obs": new_obs,
+                "rewards": rewards,
+                "dones": dones,
+                "infos": infos,
+            }
+        )
+        if not callback.on_step():
+            return None
+        truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+        next_obs = _with_terminal_observations(new_obs, dones, infos, lambda last: last)
+        step = Step(self._last_obs, next_obs, rewards, dones, dones & ~truncated, infos)
+        self._last_obs = new_obs
+        return step
+
+    def make_replay_buffer(
+        self,
+        buffer_size: int,
+        buffer_class: type[ReplayBuffer] | None,
+        kwargs: dict[str, Any] | None,
+    ) -> ReplayBuffer:
+        """Make a replay buffer of Stable-Baselines3 that fits the environment.
+
+        Args:
+            buffer_size: Transitions it holds, over all environments.
+            buffer_class: None: a plain one.
+            kwargs: Its further arguments.
+        """
+        if buffer_class is None:
+            is_dict = isinstance(self.observation_space, spaces.Dict)
+            buffer_class = DictReplayBuffer if is_dict else ReplayBuffer
+        arguments = dict(kwargs or {})
+        if issubclass(buffer_class, HerReplayBuffer):
+            arguments["env"] = self.env
+        return buffer_class(
+            buffer_size,
+            self.observation_space,
+            self.action_space,
+            device=self.device,
+            n_envs=self.n_envs,
+            **arguments,
+        )
+
+    def store(self, step: Step, actions: np.ndarray) -> None:
+        """Add a step to the replay buffer, as the environment gave it before normalisation.
+
+        Args:
+            step: What happened.
+            actions: In the units in which the algorithm learns.
+        """
+        assert self.replay_buffer is not None
+        observations: Any = step.observations
+        next_obs: Any = step.next_observations
+        rewards = step.rewards
+        if (normalization := self._vec_normalize_env) is not None:
+            new_obs = normalization.get_original_obs()
+            observations, rewards = self._last_original_obs, normalization.get_original_reward()
+            next_obs = _with_terminal_observations(
+                new_obs, step.dones, step.infos, normalization.unnormalize_obs
+            )
+            self._last_original_obs = new_obs
+        self.replay_buffer.add(observations, next_obs, actions, rewards, step.dones, step.infos)
+
+    def sample(self, batch_size: int) -> Any:
+        """Draw transitions from the replay buffer, with observations as vectors.
+
+        Shapes:
+            observations, next_observations: ``(batch, n_observations)``;
+            actions: ``(batch, n_actions)``; rewards, dones: ``(batch, 1)``. ``dones`` is 1 only
+            where the episode ended in a terminal state.
+        """
+        assert self.replay_buffer is not None
+        batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+        return batch._replace(
+            observations=self.to_vector(batch.observations),
+            next_observations=self.to_vector(batch.next_observations),
+        )
+
+    def to_vector(self, observations: Any) -> torch.Tensor:
+        """Turn observations of any kind into one vector each.
+
+        Shapes:
+            result: ``(batch, n_observations)``.
+        """
+        return _to_vector(observations, self.observation_space, self.device)
+
+    @property
+    def n_observations(self) -> int:
+        """Length of an observation as a vector."""
+        return spaces.flatdim(self.observation_space)
+
+    @property
+    def n_actions(self) -> int:
+        """Number of discrete actions, or of dimensions of a continuous one."""
+        if isinstance(self.action_space, spaces.Discrete):
+            return int(self.action_space.n)
+        return spaces.flatdim(self.action_space)
+
+    def to_env_actions(self, actions: torch.Tensor) -> np.ndarray:
+        """Turn the algorithm's actions into the environment's: from [-1, 1] into its bounds.
+
+        Raises:
+            NumericalError: If an action is not finite.
+        """
+        values = actions.cpu().numpy()
+        space = self.action_space
+        if isinstance(space, spaces.Discrete):
+            return values + space.start
+        if not np.isfinite(values).all():
+            raise NumericalError(
+                f"An action of the policy is {values.flatten().tolist()} after {self.n_updates} "
+                "updates: its weights are not finite. Often the learning rate is too high."
+            )
+        assert isinstance(space, spaces.Box)
+        values = values.reshape(-1, *space.shape)
+        scaled = space.low + 0.5 * (values + 1.0) * (space.high - space.low)
+        return np.clip(scaled, space.low, space.high).astype(space.dtype)
+
+    def from_env_actions(self, actions: np.ndarray) -> np.ndarray:
+        """Turn the environment's actions into the algorithm's: from its bounds into [-1, 1].
+
+        Shapes:
+            result: ``(batch, n_actions)`` for continuous actions, ``(batch, 1)`` for discrete.
+        """
+        space = self.action_space
+        if isinstance(space, spaces.Discrete):
+            return np.asarray(actions).reshape(-1, 1) - space.start
+        assert isinstance(space, spaces.Box)
+        scaled = 2.0 * (np.asarray(actions) - space.low) / (space.high - space.low) - 1.0
+        return scaled.reshape(len(scaled), -1).astype(np.float32)
+
+    def sample_env_actions(self) -> np.ndarray:
+        """Draw a random action of the environment's for each environment."""
+        return np.array([self.action_space.sample() for _ in range(self.n_envs)])
+
+    def _begin(
+        self, total_timesteps: int, callback: Any, reset_num_timesteps: bool
+    ) -> BaseCallback:
+        if reset_num_timesteps:
+            self.num_timesteps = 0
+        self._total_timesteps = self.num_timesteps + total_timesteps
+        if reset_num_timesteps or self._last_obs is None:
+            self._last_obs = self.env.reset()
+            if self._vec_normalize_env is not None:
+                self._last_original_obs = self._vec_normalize_env.get_original_obs()
+            if isinstance(self.replay_buffer, HerReplayBuffer):
+                _end_running_episodes(self.replay_buffer)
+        if isinstance(callback, list):
+            callback = CallbackList(callback)
+        if not isinstance(callback, BaseCallback):
+            callback = ConvertCallback(callback)
+        callback.init_callback(self)
+        return callback
+
+
+class LazyNumber:
+    """A metric that is computed only if somebody looks at it.
+
+    ``record`` is called at every step, but a value is looked at once per epoch or once per frame.
+    The logger treats it as an array with one element.
+
+    Args:
+        compute: Returns a number or a tensor with one element.
+    """
+
+    size = 1
+
+    def __init__(self, compute: Callable[[], Any]) -> None:
+        self.compute = compute
+
+    def item(self) -> float:
+        """Return the number."""
+        return float(self.compute())
+
+
+def check_finite(name: str, values: Any, update: int, **hyperparameters: Any) -> None:
+    """Stop learning when a number is no longer one.
+
+    Args:
+        name: What it is, for example ``critic_loss``.
+        values: One value per update, the last one belonging to ``update``.
+        update: Number of gradient steps so far.
+        **hyperparameters: Shown in the message.
+
+    Raises:
+        NumericalError: With what, at which update, with which hyperparameters.
+
+    >>> check_finite("critic_loss", [0.1, 0.2], update=2, learning_rate=0.1)
+    """
+    array = torch.as_tensor(values).detach().flatten()
+    # NaN and infinity survive a sum, which is one fast pass over the weights of a network.
+    if torch.isfinite(array.sum()):
+        return
+    bad = torch.nonzero(~torch.isfinite(array)).flatten()
+    if not len(bad):  # the sum overflowed, the values did not
+        return
+    first = int(bad[0])
+    shown = ", ".join(f"{key}={value}" for key, value in hyperparameters.items())
+    raise NumericalError(
+        f"{name} is {array[first].item()} at update {update - len(array) + 1 + first} ({shown}). "
+        "Often the learning rate is too high."
+    )
+
+
+def check_finite_weights(name: str, module: torch.nn.Module, update: int, **shown: Any) -> None:
+    """Stop learning when a weight is not finite, which a finite loss can hide for one update.
+
+    Args:
+        name: What the network is, for example ``actor``.
+        module: The network.
+        update: Number of gradient steps so far.
+        **shown: Hyperparameters for the message.
+
+    Raises:
+        NumericalError: With the parameter, the update and the hyperparameters.
+    """
+    for parameter_name, parameter in module.named_parameters():
+        total = parameter.detach().sum()
+        if not torch.isfinite(total) and not torch.isfinite(parameter).all():
+            check_finite(f"{name}.{parameter_name}", total, update, **shown)
+
+
+def _to_vector(values: Any, space: spaces.Space, device: torch.device) -> torch.Tensor:
+    if isinstance(space, spaces.Dict):
+        entries = [_to_vector(values[key], entry, device) for key, entry in space.spaces.items()]
+        return torch.cat(entries, dim=1)
+    tensor = torch.as_tensor(values, device=device)
+    if isinstance(space, spaces.Discrete):
+        return F.one_hot(tensor.long().flatten() - int(space.start), int(space.n)).float()
+    if isinstance(space, spaces.MultiDiscrete):
+        columns = tensor.long().reshape(len(tensor), -1).unbind(dim=1)
+        sizes = space.nvec.flatten().tolist()
+        parts = [F.one_hot(column, size) for column, size in zip(columns, sizes, strict=True)]
+        return torch.cat(parts, dim=1).float()
+    vector = tensor.reshape(len(tensor), -1).float()
+    return vector / 255.0 if space.dtype == np.uint8 else vector
+
+
+def _batch_of_one(observation: Observation) -> Observation:
+    if isinstance(observation, dict):
+        return {key: np.asarray(entry)[np.newaxis] for key, entry in observation.items()}
+    return np.asarray(observation)[np.newaxis]
+
+
+def _with_terminal_observations(
+    new_obs: Observation,
+    dones: np.ndarray,
+    infos: list[dict[str, Any]],
+    convert: Callable[[Any], Any],
+) -> Observation:
+    """Put the last observation of an ended episode in the place of the next episode's first."""
+    ended = np.flatnonzero(dones)
+    if not len(ended):
+        return new_obs
+    copies = (
+        {k: v.copy() for k, v in new_obs.items()} if isinstance(new_obs, dict) else new_obs.copy()
+    )
+    for index in ended:
+        last = convert(infos[index]["terminal_observation"])
+        if isinstance(copies, dict):
+            for key in copies:
+                copies[key][index] = last[key]
+        else:
+            copies[index] = last
+    return copies
+
+
+def _end_running_episodes(buffer: HerReplayBuffer) -> None:
+    """Close episodes that a reset has cut off, so that no goal is taken from the next one."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # what it warns about is what is wanted here
+        buffer.truncate_last_trajectory()
