@@ -5,7 +5,6 @@ from __future__ import annotations
 import importlib
 import logging
 import os
-import re
 import sys
 import traceback
 import warnings
@@ -25,8 +24,6 @@ COMMANDS = {
     "doctor": "check the installation and say how to repair it",
 }
 EXIT_INTERRUPTED, EXIT_PIPE_CLOSED = 130, 141
-# Parts of the configuration that are dictionaries: their keys can be added without Hydra's plus.
-_OPEN_GROUPS = ("algorithm.", "env_kwargs.")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -94,7 +91,7 @@ def train(arguments: list[str]) -> int:
     import hydra
     from hydra.core.hydra_config import HydraConfig
 
-    from scilab_rl.config import compose, explain_error
+    from scilab_rl.config import compose, explain_error, friendly_override
     from scilab_rl.workspace import open_desk
 
     results: list[Any] = []
@@ -123,21 +120,6 @@ def train(arguments: list[str]) -> int:
     if errors:
         raise errors[0] if isinstance(errors[0], ScilabRLError) else explain_error(errors[0])
     return results[-1].exit_code if results else 0
-
-
-def friendly_override(argument: str) -> str:
-    """Add Hydra's ``++`` where a key of an open dictionary is set: the same meaning, always valid.
-
-    >>> friendly_override("algorithm.gamma=0.9")
-    '++algorithm.gamma=0.9'
-    >>> friendly_override("algorithm=sac")
-    'algorithm=sac'
-    >>> friendly_override("+env_kwargs.reward_type=dense")
-    '++env_kwargs.reward_type=dense'
-    """
-    match = re.match(r"\+{0,2}(?=[a-z])", argument)
-    bare = argument[match.end() :] if match else argument
-    return f"++{bare}" if bare.startswith(_OPEN_GROUPS) and "=" in bare else argument
 
 
 def _set_up_messages(debug: bool) -> None:

@@ -105,6 +105,8 @@ KEYS = (
     Key("n_threads", WHOLE, "CPU threads of PyTorch; 1 is fastest for small networks", low=1),
 )
 GROUPS = ("algorithm", "tracking")
+# Parts of the configuration that are dictionaries: their keys can be added without Hydra's plus.
+_OPEN_GROUPS = ("algorithm.", "env_kwargs.")
 
 # Packages that the configuration of an earlier run may name.
 _TRUSTED = (
@@ -202,6 +204,20 @@ def _refuse_foreign_class(target: str, path: Path) -> None:
         f"'{path}' names '{target}', which is no part of Scilab-RL, its libraries or your desk. "
         "A recorded run is data and must not bring code with it."
     )
+
+
+def friendly_override(argument: str) -> str:
+    """Add Hydra's ``++`` where a key of an open dictionary is set: same meaning, always works.
+
+    >>> friendly_override("algorithm.gamma=0.9")
+    '++algorithm.gamma=0.9'
+    >>> friendly_override("algorithm=sac")
+    'algorithm=sac'
+    >>> friendly_override("+env_kwargs.reward_type=dense")
+    '++env_kwargs.reward_type=dense'
+    """
+    bare = re.sub(r"^\+{1,2}(?=[a-z])", "", argument)
+    return f"++{bare}" if bare.startswith(_OPEN_GROUPS) and "=" in bare else argument
 
 
 def tuned_option(cfg: DictConfig) -> str | None:

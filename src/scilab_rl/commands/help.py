@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping
 
 from omegaconf import DictConfig, OmegaConf
 
-from scilab_rl.commands.tables import write
+from scilab_rl.commands.tables import as_typed, write
 from scilab_rl.config import ALIASES, KEYS, SWITCH, Key
 from scilab_rl.workspace import SHIPPED_CONF, config_files
 
@@ -59,7 +59,7 @@ def _lines(commands: Mapping[str, str], width: int) -> Iterable[str]:
     yield from _section("Groups: a file each, of ours or in conf/", _groups(main), width)
     for heading, names in _headings().items():
         keys = [key for key in KEYS if key.name in names]
-        facts = [(f"{key.name}={_yaml(main[key.name])}", _meaning(key)) for key in keys]
+        facts = [(f"{key.name}={as_typed(main[key.name])}", _meaning(key)) for key in keys]
         yield from _section(heading, facts, width)
     wrappers = [(f"+{alias}=1", "") for alias in ALIASES]
     yield from _section("Wrappers around the environment", wrappers, width)
@@ -100,19 +100,6 @@ def _headings() -> dict[str, list[str]]:
         elif name and name[0] in known:
             headings.setdefault(comment, []).append(name[0])
     return headings
-
-
-def _yaml(value: object) -> str:
-    """Return a default as the user would type it."""
-    if value is None:
-        return "null"
-    return (
-        repr(value)
-        if value == ""
-        else str(value).lower()
-        if isinstance(value, bool)
-        else str(value)
-    )
 
 
 def _meaning(key: Key) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 Row = Mapping[str, Any]
 
 # A longer cell is folded into several lines before a column is left out.
-_FOLD_WIDTH = 24
+_FOLD_WIDTH = 20
 _GAP = 2
 _STYLES = {
     "ok": "green",
@@ -55,6 +55,17 @@ def print_json(value: Any) -> None:
     """Print a value for programs."""
     write(json.dumps(value, indent=2))
     sys.stdout.flush()
+
+
+def as_typed(value: Any) -> str:
+    """Return a value as the user would type it on the command line.
+
+    >>> as_typed(None), as_typed(True), as_typed("")
+    ('null', 'true', "''")
+    """
+    if value is None or isinstance(value, bool):
+        return json.dumps(value)
+    return "''" if value == "" else str(value)
 
 
 def write(line: str) -> None:
