@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 import torch
-import torch.nn.functional as F
 from gymnasium import spaces
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback
@@ -24,11 +23,20 @@ from stable_baselines3.common.utils import (
 )
 from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from stable_baselines3.her import HerReplayBuffer
+from torch import nn
 
+from scilab_rl.algorithms.finite import check_finite, check_finite_weights
+from scilab_rl.algorithms.observations import (
+    Observation,
+    batch_of_one,
+    to_vector,
+    with_terminal_observations,
+)
 from scilab_rl.errors import ConfigError, NumericalError
 from scilab_rl.metrics.logger import MetricLogger
 
-Observation = np.ndarray | dict[str, np.ndarray]
+# Hyperparameters named in the message when a number is no longer one.
+SHOWN_WITH_NAN = ("learning_rate", "gamma", "batch_size")
 Self = TypeVar("Self", bound="OneFileAlgorithm")
 
 
@@ -164,7 +172,7 @@ class OneFileAlgorithm(ABC):
         """
         is_batch = is_vectorized_observation(observation, self.observation_space)  # type: ignore[arg-type]
         if not is_batch:
-            observation = _batch_of_one(observation)
+            observation = batch_of_one(observation)
         with torch.no_grad():
             actions = self.to_env_actions(self.act(self.to_vector(observation), deterministic))
         return (actions if is_batch else actions[0]), state
@@ -202,7 +210,7 @@ class OneFileAlgorithm(ABC):
         if not callback.on_step():
             return None
         truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
-        next_obs = _with_terminal_observations(new_obs, dones, infos, lambda last: last)
+        next_obs = with_terminal_observations(new_obs, dones, infos, lambda last: last)
         step = Step(self._last_obs, next_obs, rewards, dones, dones & ~truncated, infos)
         self._last_obs = new_obs
         return step
@@ -249,7 +257,7 @@ class OneFileAlgorithm(ABC):
         if (normalization := self._vec_normalize_env) is not None:
             new_obs = normalization.get_original_obs()
             observations, rewards = self._last_original_obs, normalization.get_original_reward()
-            next_obs = _with_terminal_observations(
+            next_obs = with_terminal_observations(
                 new_obs, step.dones, step.infos, normalization.unnormalize_obs
             )
             self._last_original_obs = new_obs
@@ -276,7 +284,7 @@ class OneFileAlgorithm(ABC):
         Shapes:
             result: ``(batch, n_observations)``.
         """
-        return _to_vector(observations, self.observation_space, self.device)
+        return to_vector(observations, self.observation_space, self.device)
 
     @property
     def n_observations(self) -> int:
@@ -327,6 +335,29 @@ class OneFileAlgorithm(ABC):
         """Draw a random action of the environment's for each environment."""
         return np.array([self.action_space.sample() for _ in range(self.n_envs)])
 
+    def record_losses(self, losses: Mapping[str, Sequence[torch.Tensor]]) -> None:
+        """Record the mean of each loss as ``train/<name>``, and refuse what is not finite.
+
+        Args:
+            losses: Name to one value per update since the last call.
+
+        Raises:
+            NumericalError: If a loss, or a weight of any of the networks, is not finite.
+        """
+        shown = {name: getattr(self, name) for name in SHOWN_WITH_NAN if hasattr(self, name)}
+        for name, values in losses.items():
+            stacked = torch.stack(tuple(values))
+            check_finite(name, stacked, self.n_updates, **shown)
+            self.logger.record(f"train/{name}", stacked.mean())
+        for name, value in vars(self).items():
+            if isinstance(value, nn.Module):
+                check_finite_weights(name, value, self.n_updates, **shown)
+
+    def record_dimensions(self, name: str, vector: torch.Tensor | np.ndarray) -> None:
+        """Record each entry of a vector as ``<name>_<index>``."""
+        for index, value in enumerate(vector.flatten().tolist()):
+            self.logger.record(f"{name}_{index}", value)
+
     def _begin(
         self, total_timesteps: int, callback: Any, reset_num_timesteps: bool
     ) -> BaseCallback:
@@ -365,98 +396,6 @@ class LazyNumber:
     def item(self) -> float:
         """Return the number."""
         return float(self.compute())
-
-
-def check_finite(name: str, values: Any, update: int, **hyperparameters: Any) -> None:
-    """Stop learning when a number is no longer one.
-
-    Args:
-        name: What it is, for example ``critic_loss``.
-        values: One value per update, the last one belonging to ``update``.
-        update: Number of gradient steps so far.
-        **hyperparameters: Shown in the message.
-
-    Raises:
-        NumericalError: With what, at which update, with which hyperparameters.
-
-    >>> check_finite("critic_loss", [0.1, 0.2], update=2, learning_rate=0.1)
-    """
-    array = torch.as_tensor(values).detach().flatten()
-    # NaN and infinity survive a sum, which is one fast pass over the weights of a network.
-    if torch.isfinite(array.sum()):
-        return
-    bad = torch.nonzero(~torch.isfinite(array)).flatten()
-    if not len(bad):  # the sum overflowed, the values did not
-        return
-    first = int(bad[0])
-    shown = ", ".join(f"{key}={value}" for key, value in hyperparameters.items())
-    raise NumericalError(
-        f"{name} is {array[first].item()} at update {update - len(array) + 1 + first} ({shown}). "
-        "Often the learning rate is too high."
-    )
-
-
-def check_finite_weights(name: str, module: torch.nn.Module, update: int, **shown: Any) -> None:
-    """Stop learning when a weight is not finite, which a finite loss can hide for one update.
-
-    Args:
-        name: What the network is, for example ``actor``.
-        module: The network.
-        update: Number of gradient steps so far.
-        **shown: Hyperparameters for the message.
-
-    Raises:
-        NumericalError: With the parameter, the update and the hyperparameters.
-    """
-    for parameter_name, parameter in module.named_parameters():
-        total = parameter.detach().sum()
-        if not torch.isfinite(total) and not torch.isfinite(parameter).all():
-            check_finite(f"{name}.{parameter_name}", total, update, **shown)
-
-
-def _to_vector(values: Any, space: spaces.Space, device: torch.device) -> torch.Tensor:
-    if isinstance(space, spaces.Dict):
-        entries = [_to_vector(values[key], entry, device) for key, entry in space.spaces.items()]
-        return torch.cat(entries, dim=1)
-    tensor = torch.as_tensor(values, device=device)
-    if isinstance(space, spaces.Discrete):
-        return F.one_hot(tensor.long().flatten() - int(space.start), int(space.n)).float()
-    if isinstance(space, spaces.MultiDiscrete):
-        columns = tensor.long().reshape(len(tensor), -1).unbind(dim=1)
-        sizes = space.nvec.flatten().tolist()
-        parts = [F.one_hot(column, size) for column, size in zip(columns, sizes, strict=True)]
-        return torch.cat(parts, dim=1).float()
-    vector = tensor.reshape(len(tensor), -1).float()
-    return vector / 255.0 if space.dtype == np.uint8 else vector
-
-
-def _batch_of_one(observation: Observation) -> Observation:
-    if isinstance(observation, dict):
-        return {key: np.asarray(entry)[np.newaxis] for key, entry in observation.items()}
-    return np.asarray(observation)[np.newaxis]
-
-
-def _with_terminal_observations(
-    new_obs: Observation,
-    dones: np.ndarray,
-    infos: list[dict[str, Any]],
-    convert: Callable[[Any], Any],
-) -> Observation:
-    """Put the last observation of an ended episode in the place of the next episode's first."""
-    ended = np.flatnonzero(dones)
-    if not len(ended):
-        return new_obs
-    copies = (
-        {k: v.copy() for k, v in new_obs.items()} if isinstance(new_obs, dict) else new_obs.copy()
-    )
-    for index in ended:
-        last = convert(infos[index]["terminal_observation"])
-        if isinstance(copies, dict):
-            for key in copies:
-                copies[key][index] = last[key]
-        else:
-            copies[index] = last
-    return copies
 
 
 def _end_running_episodes(buffer: HerReplayBuffer) -> None:

@@ -1,11 +1,9 @@
 """Soft actor-critic (SAC) in one file, with optional hindsight experience replay (HER).
 
 Haarnoja et al., 2018, "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905; HER:
-Andrychowicz et al., 2017, arXiv 1707.01495. The agent maximises reward plus entropy:
-
-    J(pi) = E[ sum_t gamma^t (r_t + alpha H(pi(. | s_t))) ]
-
-An update takes a batch (s, a, r, s', d) from the replay buffer and does, in this order:
+Andrychowicz et al., 2017, arXiv 1707.01495. The agent maximises reward plus entropy,
+E[sum_t gamma^t (r_t + alpha H(pi(.|s_t)))]. An update takes a batch (s, a, r, s', d) from the
+replay buffer and does, in this order:
 
     temperature  J(alpha) = E[-log alpha (log pi(a~|s) + H_target)]                       (eq. 18)
     target       y = r + gamma (1 - d) (min_i Q'_i(s', a') - alpha log pi(a'|s'))           (eq. 3)
@@ -28,7 +26,9 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from collections import defaultdict
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,13 +40,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
-from scilab_rl.algorithms.base import (
-    LazyNumber,
-    Observation,
-    OneFileAlgorithm,
-    check_finite,
-    check_finite_weights,
-)
+from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
@@ -61,8 +55,7 @@ class Actor(nn.Module):
         scale: Largest action.
 
     Shapes:
-        observations: ``(batch, n_observations)``; actions: ``(batch, n_actions)``;
-        log probabilities: ``(batch, 1)``.
+        observations: ``(batch, n_observations)``; actions: ``(batch, n_actions)``.
     """
 
     def __init__(
@@ -152,8 +145,7 @@ class CLEANSAC(OneFileAlgorithm):
         net_arch: Sizes of the hidden layers of actor and critics.
         replay_buffer_class: None: a plain replay buffer.
         replay_buffer_kwargs: Further arguments of the replay buffer.
-        seed: Seed of weights, exploration and environments.
-        device: Where networks are computed.
+        seed, device: See `OneFileAlgorithm`.
     """
 
     supported_action_spaces = (spaces.Box,)
@@ -200,11 +192,9 @@ class CLEANSAC(OneFileAlgorithm):
         self.actor = Actor(*sizes, scale=action_scale_factor).to(self.device)
         self.critic = Critics(*sizes, n_critics).to(self.device)
         self.critic_target = copy.deepcopy(self.critic).requires_grad_(False)
-        self.actor_parameters = list(self.actor.parameters())
-        self.actor_optimizer = torch.optim.Adam(self.actor_parameters, learning_rate, fused=True)
-        self.critic_optimizer = torch.optim.Adam(
-            self.critic.parameters(), learning_rate, fused=True
-        )
+        adam = partial(torch.optim.Adam, lr=learning_rate, fused=True)
+        self.actor_optimizer = adam(self.actor.parameters())
+        self.critic_optimizer = adam(self.critic.parameters())
 
         self.learns_ent_coef, initial = parse_ent_coef(ent_coef)
         self.ent_coef = torch.tensor(initial, device=self.device)
@@ -213,7 +203,7 @@ class CLEANSAC(OneFileAlgorithm):
             self.target_entropy = float(target_entropy)
         if self.learns_ent_coef:
             self.log_ent_coef = self.ent_coef.log().requires_grad_(True)
-            self.ent_coef_optimizer = torch.optim.Adam([self.log_ent_coef], learning_rate)
+            self.ent_coef_optimizer = adam([self.log_ent_coef])
 
         self.replay_buffer = self.make_replay_buffer(
             buffer_size, replay_buffer_class, replay_buffer_kwargs
@@ -258,24 +248,27 @@ class CLEANSAC(OneFileAlgorithm):
 
     def train(self, gradient_steps: int) -> None:
         """Update temperature, critics, actor and target critics, in this order."""
-        losses: dict[str, list[Tensor]] = {}
-        if self.learns_ent_coef:
-            losses["ent_coef_loss"] = []
-        losses |= {"critic_loss": [], "actor_loss": []}
+        losses: dict[str, list[Tensor]] = defaultdict(list)
         for _ in range(gradient_steps):
             batch = self.sample(self.batch_size)
             actions, log_prob = self.actor.sample(batch.observations)
 
             if self.learns_ent_coef:
                 self.ent_coef = self.log_ent_coef.detach().exp()
-                losses["ent_coef_loss"].append(self._update_temperature(log_prob.detach()))
+                loss = temperature_loss(self.log_ent_coef, log_prob.detach(), self.target_entropy)
+                losses["ent_coef_loss"].append(descend(self.ent_coef_optimizer, loss))
 
             targets = self.compute_targets(batch)
-            losses["critic_loss"].append(self._update_critics(batch, targets))
-            losses["actor_loss"].append(self._update_actor(batch.observations, actions, log_prob))
-            self._update_targets()
+            loss = critic_loss(self.critic(batch.observations, batch.actions), targets)
+            losses["critic_loss"].append(descend(self.critic_optimizer, loss))
+
+            loss = actor_loss(log_prob, self.critic(batch.observations, actions), self.ent_coef)
+            losses["actor_loss"].append(descend(self.actor_optimizer, loss))
+
+            follow(self.critic_target, self.critic, self.tau)
             self.n_updates += 1
-        self._record_and_check(losses)
+        self.record_losses(losses)
+        self.logger.record("train/ent_coef", self.ent_coef)
 
     @torch.no_grad()
     def compute_targets(self, batch: Any) -> Tensor:
@@ -286,65 +279,16 @@ class CLEANSAC(OneFileAlgorithm):
         dones = torch.zeros_like(batch.dones) if self.ignore_dones_for_qvalue else batch.dones
         return soft_target(batch.rewards, dones, next_q, next_log_prob, self.ent_coef, self.gamma)
 
-    def _update_temperature(self, log_prob: Tensor) -> Tensor:
-        loss = temperature_loss(self.log_ent_coef, log_prob, self.target_entropy)
-        self.ent_coef_optimizer.zero_grad()
-        loss.backward()
-        self.ent_coef_optimizer.step()
-        return loss.detach()
-
-    def _update_critics(self, batch: Any, targets: Tensor) -> Tensor:
-        loss = critic_loss(self.critic(batch.observations, batch.actions), targets)
-        self.critic_optimizer.zero_grad()
-        loss.backward()
-        self.critic_optimizer.step()
-        return loss.detach()
-
-    def _update_actor(self, observations: Tensor, actions: Tensor, log_prob: Tensor) -> Tensor:
-        loss = actor_loss(log_prob, self.critic(observations, actions), self.ent_coef)
-        self.actor_optimizer.zero_grad()
-        # The critics pass the gradient on; their own weights do not need one here.
-        loss.backward(inputs=self.actor_parameters)
-        self.actor_optimizer.step()
-        return loss.detach()
-
-    @torch.no_grad()
-    def _update_targets(self) -> None:
-        for target, source in zip(
-            self.critic_target.parameters(), self.critic.parameters(), strict=True
-        ):
-            target.lerp_(source, self.tau)
-
-    def _record_and_check(self, losses: dict[str, list[Tensor]]) -> None:
-        shown = {
-            "learning_rate": self.learning_rate,
-            "gamma": self.gamma,
-            "batch_size": self.batch_size,
-        }
-        for name, values in losses.items():
-            stacked = torch.stack(values)
-            check_finite(name, stacked, self.n_updates, **shown)
-            self.logger.record(f"train/{name}", stacked.mean())
-        self.logger.record("train/ent_coef", self.ent_coef)
-        check_finite_weights("critic", self.critic, self.n_updates, **shown)
-        check_finite_weights("actor", self.actor, self.n_updates, **shown)
-
     def _record_step(self, observations: Observation, env_actions: np.ndarray) -> None:
-        """Record what the first environment's agent sees, does and thinks of it."""
-        self.logger.record(
-            "train/rollout_q_step",
-            LazyNumber(lambda: self.q_values(observations, env_actions)[0].min()),
-        )
-        self.logger.record(
-            "train/rollout_logpi_step",
-            LazyNumber(lambda: self.log_prob(observations, env_actions)[0]),
-        )
+        """Record what the agent of the first environment sees, does and thinks of it."""
+        q = LazyNumber(lambda: self.q_values(observations, env_actions)[0].min())
+        self.logger.record("train/rollout_q_step", q)
+        logpi = LazyNumber(lambda: self.log_prob(observations, env_actions)[0])
+        self.logger.record("train/rollout_logpi_step", logpi)
         if self.log_obs_step:
-            for index, value in enumerate(self.to_vector(observations)[0].tolist()):
-                self.logger.record(f"train/rollout_obs_step_{index}", value)
+            self.record_dimensions("train/rollout_obs_step", self.to_vector(observations)[0])
         if self.log_act_step:
-            for index, value in enumerate(env_actions[0].flatten().tolist()):
-                self.logger.record(f"train/rollout_act_step_{index}", value)
+            self.record_dimensions("train/rollout_act_step", env_actions[0])
 
     @torch.no_grad()
     def q_values(self, observations: Observation, env_actions: np.ndarray) -> Tensor:
@@ -426,6 +370,21 @@ def critic_variance(q_values: Tensor) -> Tensor:
     return q_values.var(dim=1, correction=0, keepdim=True)
 
 
+def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
+    """Take one step down the gradient, of the optimizer's own parameters only; return the loss."""
+    optimizer.zero_grad()
+    loss.backward(inputs=[p for group in optimizer.param_groups for p in group["params"]])
+    optimizer.step()
+    return loss.detach()
+
+
+@torch.no_grad()
+def follow(target: nn.Module, source: nn.Module, tau: float) -> None:
+    """Move the target network a fraction tau towards the learned one."""
+    for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
+        slow.lerp_(fast, tau)
+
+
 def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
     """Return whether alpha is learned, and its initial or fixed value.
 
@@ -439,8 +398,5 @@ def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:
     except ValueError:
         value = math.nan
     if not (value > 0 if learned else value >= 0):
-        raise ValueError(
-            f"ent_coef must be auto, auto_<initial value above 0> or a number of at least 0, "
-            f"but it is {ent_coef!r}"
-        )
+        raise ValueError(f"ent_coef must be auto, auto_0.1 or a number, but it is {ent_coef!r}")
     return learned, value
