@@ -1,7 +1,7 @@
 """What it takes to test an algorithm: tiny environments, and an exam that any algorithm can take.
 
-Importing this package registers the environments, so that they can be made from the command line too:
-``env=scilab_rl.testing:TinyReach-v0``. The exam is in ``scilab_rl.testing.algorithms``.
+Importing this package registers the environments, so that they can be made from the command line
+too: ``env=scilab_rl.testing:TinyReach-v0``. The exam is in ``scilab_rl.testing.algorithms``.
 """
 
 from scilab_rl.testing.environments import TINY_ENVIRONMENTS, decode_frame, register

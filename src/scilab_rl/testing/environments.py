@@ -38,10 +38,11 @@ def register() -> None:
 
 
 class TinyReach(gym.Env):
-    """A point in the square [-1, 1] x [-1, 1] moves to a goal; the smallest task for hindsight replay.
+    """A point in a square moves to a goal; the smallest task for hindsight replay.
 
-    An action moves the point by at most 0.25 per axis. The reward is 0 within 0.2 of the goal and -1
-    elsewhere; as with the Fetch tasks, only the step limit ends an episode.
+    Places are in [-1, 1] x [-1, 1], and an action moves the point by at most 0.25 per axis. The
+    reward is 0 within 0.2 of the goal and -1 elsewhere. As with the Fetch tasks, only the step
+    limit ends an episode.
     """
 
     STEP_LENGTH = 0.25
@@ -136,7 +137,7 @@ class TinyReachDiscrete(TinyReach):
 
 
 class TinyBox(gym.Env):
-    """TinyReach for algorithms without goals: one vector as observation, minus the distance as reward."""
+    """TinyReach as one vector of place and goal, with minus their distance as reward."""
 
     def __init__(self) -> None:
         self._reach = TinyReach()
@@ -162,10 +163,10 @@ class TinyBox(gym.Env):
 
 
 class TinyDiscrete(gym.Env):
-    """A corridor with two doors: the observed one pays 1, the other one -1, and both end the episode.
+    """A corridor with two doors: one pays 1, the other costs 1, and both end the episode.
 
-    The walker starts near the middle of [-1, 1] and steps left (0) or right (1) by 0.2. The observation
-    is its place and the side of the good door (-1 or 1).
+    The walker starts near the middle of [-1, 1] and steps left (0) or right (1) by 0.2. The
+    observation is its place and the side of the door that pays (-1 or 1).
     """
 
     STEP_LENGTH = 0.2
@@ -174,13 +175,13 @@ class TinyDiscrete(gym.Env):
         self.action_space = spaces.Discrete(2)
         self.observation_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self._place = 0.0
-        self._good_side = 1.0
+        self._paying_side = 1.0
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
-        """Put the walker near the middle and choose the good door."""
+        """Put the walker near the middle and choose the door that pays."""
         super().reset(seed=seed)
         self._place = float(self.np_random.uniform(-0.3, 0.3))
-        self._good_side = 1.0 if self.np_random.random() < 0.5 else -1.0
+        self._paying_side = 1.0 if self.np_random.random() < 0.5 else -1.0
         return self._observe(), {"is_success": False}
 
     def step(self, action: Any) -> Any:
@@ -188,19 +189,19 @@ class TinyDiscrete(gym.Env):
         direction = 1.0 if int(action) == 1 else -1.0
         self._place = min(1.0, max(-1.0, self._place + self.STEP_LENGTH * direction))
         terminated = abs(self._place) >= 1.0
-        reward = self._place * self._good_side if terminated else 0.0
+        reward = self._place * self._paying_side if terminated else 0.0
         return self._observe(), reward, terminated, False, {"is_success": reward > 0.0}
 
     def _observe(self) -> np.ndarray:
-        return np.array([self._place, self._good_side], np.float32)
+        return np.array([self._place, self._paying_side], np.float32)
 
 
 class TinyPixels(gym.Env):
-    """Frames, observations and rewards that all say which step of which episode they belong to.
+    """Frames, observations and rewards all say which step of which episode they belong to.
 
-    Episodes count from 0 with each reset, steps from 0 at the reset. The reward is ``episode + step /
-    100``, the observation ``(episode, step)``, and `decode_frame` reads both numbers from a frame. The
-    blocks of a frame are large enough to survive video compression.
+    Episodes count from 0 with each reset, steps from 0 at the reset. The observation is
+    ``(episode, step)``, the reward ``episode + step / 100``, and `decode_frame` reads both numbers
+    from a frame. The blocks of a frame are large enough to survive video compression.
 
     Args:
         render_mode: ``rgb_array``, or None for no frames.
