@@ -1,0 +1,1 @@
+"""Your algorithms: one file each, with a YAML of the same name in conf/algorithm/."""

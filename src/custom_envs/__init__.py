@@ -1,0 +1,1 @@
+"""Your environments: one file each, made known here with ``gymnasium.register(...)``."""
