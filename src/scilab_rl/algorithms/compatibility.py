@@ -44,6 +44,11 @@ def supported_action_spaces(cls: type) -> tuple[type[spaces.Space], ...] | None:
     return None
 
 
+def reads_dictionaries(cls: type) -> bool:
+    """Tell whether an algorithm class has a policy for Dict observations, and so for goals."""
+    return not any(ancestor.__name__ in _NO_DICT_OBSERVATIONS for ancestor in cls.__mro__)
+
+
 def is_goal_space(space: spaces.Space) -> bool:
     """Tell whether observations carry an achieved and a desired goal."""
     return isinstance(space, spaces.Dict) and all(key in space.spaces for key in GOAL_KEYS)
@@ -91,7 +96,7 @@ def check_pair(
 def _check_dictionary(name: str, cls: type, env_id: str, space: spaces.Dict) -> None:
     if any(isinstance(entry, (spaces.Dict, spaces.Tuple)) for entry in space.spaces.values()):
         raise ConfigError(f"{env_id} has nested dictionaries as observations; add +flatten_obs=1.")
-    if any(ancestor.__name__ in _NO_DICT_OBSERVATIONS for ancestor in cls.__mro__):
+    if not reads_dictionaries(cls):
         raise ConfigError(
             f"{name} reads plain vectors, but {env_id} has Dict observations; add +flatten_obs=1."
         )

@@ -11,7 +11,7 @@ from typing import Any
 Row = Mapping[str, Any]
 
 # A longer cell is folded into several lines before a column is left out.
-_FOLD_WIDTH = 20
+_FOLD_WIDTH = 18
 _GAP = 2
 _STYLES = {
     "ok": "green",
