@@ -247,10 +247,10 @@ def prepare(cfg: DictConfig) -> DictConfig:
 def check_keys(cfg: DictConfig) -> None:
     """Refuse unknown keys and values of the wrong type or out of range."""
     known = {key.name: key for key in KEYS}
-    for name in cfg:
+    for name in map(str, cfg):
         if name not in known and name not in (*GROUPS, *ALIASES, "hydra"):
             raise ConfigError(
-                f"There is no key '{name}'.{did_you_mean(str(name), [*known, *GROUPS, *ALIASES])} "
+                f"There is no key '{name}'.{did_you_mean(name, [*known, *GROUPS, *ALIASES])} "
                 "`scilab-rl --help` lists all keys."
             )
     for key in KEYS:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import datetime as dt
 import json
@@ -110,8 +111,9 @@ class RunDirectory:
     def discard(self) -> None:
         """Remove the directory of a run that was refused before its first step."""
         shutil.rmtree(self.path, ignore_errors=True)
-        if self.path.parent.is_dir() and not any(self.path.parent.iterdir()):
-            self.path.parent.rmdir()
+        for folder in list(self.path.parents)[:2]:
+            with contextlib.suppress(OSError):  # another run lives there
+                folder.rmdir()
 
     def write_result(self, result: RunResult) -> None:
         """Replace ``result.json``."""

@@ -98,18 +98,14 @@ def _check_range(argument: str, value: Any) -> None:
 def _check_type(argument: str, value: Any, cls: Callable[..., Any]) -> None:
     """Compare with the type of the default: a number cannot be replaced by a word.
 
-    Words that a parameter understands (``auto``, ``auto_0.1``, ``lin_3e-4``) are left to the algorithm
-    when its annotation allows text.
+    Words that a parameter understands (``auto``, ``auto_0.1``) are left to the algorithm when its
+    annotation allows text.
     """
     parameter = inspect.signature(cls).parameters[argument]
     default, annotation = parameter.default, str(parameter.annotation)
     is_number = isinstance(default, (int, float)) and not isinstance(default, bool)
-    if (
-        is_number
-        and isinstance(value, (str, list))
-        and "str" not in annotation
-        and "tuple" not in annotation
-    ):
+    takes_words = "str" in annotation or "tuple" in annotation
+    if is_number and isinstance(value, (str, list)) and not takes_words:
         raise ConfigError(f"algorithm.{argument} must be a number, but it is {value!r}.")
     if isinstance(default, bool) and not isinstance(value, bool) and value not in (0, 1):
         raise ConfigError(f"algorithm.{argument} must be true or false, but it is {value!r}.")

@@ -88,13 +88,14 @@ def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:
 def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
     """Return ``learning_starts``, late enough for one whole episode to have been stored."""
     limits = [spec.max_episode_steps if spec else None for spec in env.get_attr("spec")]
-    if None in limits:
+    longest = max((limit for limit in limits if limit is not None), default=0)
+    if None in limits or longest == 0:
         raise ConfigError(
             "Hindsight experience replay needs a step limit, and this environment has none; add "
             "+env_kwargs.max_episode_steps=N or ++algorithm.replay_buffer_class=null."
         )
     wanted = int(arguments.get("learning_starts", 100))
-    needed = max(limits) * env.num_envs + env.num_envs
+    needed = longest * env.num_envs + env.num_envs
     if wanted < needed:
         _log.info(
             "learning_starts raised from %d to %d: hindsight replay needs one whole episode first.",
@@ -105,7 +106,7 @@ def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
 
 
 def _shaped_noise(noise: NormalActionNoise, env: VecEnv) -> NormalActionNoise:
-    shape = env.action_space.shape
+    shape = env.action_space.shape or ()
     return NormalActionNoise(
         np.broadcast_to(noise._mu, shape), np.broadcast_to(noise._sigma, shape)
     )

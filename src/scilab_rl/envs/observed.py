@@ -9,11 +9,11 @@ from typing import Any, Protocol
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
-from scilab_rl.envs.frames import FRAME_KEY
+from scilab_rl.envs.frames import FRAME_KEY, STATE_KEY
 from scilab_rl.errors import EnvironmentError_, ScilabRLError
+from scilab_rl.metrics.success import success_of as success_of
 
 Observation = np.ndarray | dict[str, np.ndarray]
-SUCCESS_KEYS = ("is_success", "success")
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class StepBatch:
         next_observations: What the agent sees next; after an episode's end this is already the
             first observation of the next episode.
         frames: The scene after this step, for environments that capture frames.
+        states: The simulator's state in that scene, where there is one.
     """
 
     phase: str
@@ -46,6 +47,7 @@ class StepBatch:
     infos: Sequence[dict[str, Any]]
     next_observations: Observation
     frames: Sequence[np.ndarray | None]
+    states: Sequence[np.ndarray | None]
 
 
 class StepObserver(Protocol):
@@ -70,6 +72,7 @@ class ObservedVecEnv(VecEnvWrapper):
         observers: Called in order at each step.
         step_count: Steps so far over all environments.
         reset_frame: The first scene of environment 0's running episode, while frames are captured.
+        reset_state: The simulator's state in that scene.
     """
 
     def __init__(self, venv: VecEnv, phase: str, name: str) -> None:
@@ -81,6 +84,7 @@ class ObservedVecEnv(VecEnvWrapper):
         self.episodes = np.zeros(self.num_envs, dtype=np.int64)
         self.episode_steps = np.zeros(self.num_envs, dtype=np.int64)
         self.reset_frame: np.ndarray | None = None
+        self.reset_state: np.ndarray | None = None
         self._observations: Any = None
         self._actions: Any = None
 
@@ -90,7 +94,7 @@ class ObservedVecEnv(VecEnvWrapper):
             self._observations = self.venv.reset()
         self._check_finite(self._observations, "observation")
         self.episode_steps[:] = 0
-        self.reset_frame = self.venv.reset_infos[0].pop(FRAME_KEY, None)
+        self._take_first_scene()
         return self._observations
 
     def step_async(self, actions: np.ndarray) -> None:
@@ -103,7 +107,10 @@ class ObservedVecEnv(VecEnvWrapper):
         """Finish the step, check it and show it to the observers."""
         with self._errors_named("step"):
             observations, rewards, dones, infos = self.venv.step_wait()
-        self._check_finite(observations, "observation")
+        observed: Any = observations
+        self._check_finite(observed, "observation")
+        for index in np.flatnonzero(dones):
+            self._check_finite(_batch_of_one(infos[index]["terminal_observation"]), "observation")
         self._check_finite(rewards, "reward")
         self.step_count += self.num_envs
         batch = StepBatch(
@@ -116,17 +123,22 @@ class ObservedVecEnv(VecEnvWrapper):
             rewards,
             dones,
             infos,
-            observations,
+            observed,
             [info.pop(FRAME_KEY, None) for info in infos],
+            [info.pop(STATE_KEY, None) for info in infos],
         )
         for observer in self.observers:
             observer.on_step(batch)
         if dones[0]:
-            self.reset_frame = self.venv.reset_infos[0].pop(FRAME_KEY, None)
+            self._take_first_scene()
         self.episodes += dones
         self.episode_steps = np.where(dones, 0, self.episode_steps + 1)
-        self._observations = observations
+        self._observations = observed
         return observations, rewards, dones, infos
+
+    def _take_first_scene(self) -> None:
+        info = self.venv.reset_infos[0]
+        self.reset_frame, self.reset_state = info.pop(FRAME_KEY, None), info.pop(STATE_KEY, None)
 
     def state(self) -> dict[str, Any]:
         """Return counters and current observations, for a checkpoint."""
@@ -177,9 +189,7 @@ class _NamedErrors:
             ) from error
 
 
-def success_of(info: Mapping[str, Any]) -> bool | None:
-    """Return whether the step's info reports success, or None when the task has no such notion."""
-    for key in SUCCESS_KEYS:
-        if key in info:
-            return bool(info[key])
-    return None
+def _batch_of_one(observation: Any) -> Any:
+    if isinstance(observation, dict):
+        return {key: np.asarray(value)[None] for key, value in observation.items()}
+    return np.asarray(observation)[None]

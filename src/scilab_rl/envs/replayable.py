@@ -22,7 +22,7 @@ class ReplayableEpisode(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self._reset_arguments: dict[str, Any] = {}
-        self._generator_state: dict[str, Any] | None = None
+        self._generator_state: Any = None
         self._actions: list[Any] = []
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:

@@ -7,8 +7,10 @@ It has the interface of Stable-Baselines3's ``Logger``, so that any of its algor
 from __future__ import annotations
 
 import logging
+import math
 import numbers
 from collections import defaultdict
+from collections.abc import Callable, Iterable
 from typing import Any
 
 _log = logging.getLogger("scilab_rl.algorithm")
@@ -28,6 +30,8 @@ class MetricLogger:
         self.name_to_value: dict[str, Any] = {}
         self._sums: dict[str, float] = defaultdict(float)
         self._counts: dict[str, int] = defaultdict(int)
+        self._watched: frozenset[str] = frozenset()
+        self._seen: dict[str, float] = {}
 
     def record(self, key: str, value: Any, exclude: object = None) -> None:
         """Record a value; an earlier one of the same epoch is replaced.
@@ -38,6 +42,18 @@ class MetricLogger:
             exclude: Accepted for Stable-Baselines3, ignored.
         """
         self.name_to_value[key] = value
+        if key in self._watched:
+            self._see(key, value)
+
+    def record_lazy(self, key: str, function: Callable[[], Any]) -> None:
+        """Record a value that is drawn beside the scene and is too expensive for every step.
+
+        Args:
+            key: ``section/name``.
+            function: Returns the value; called only while somebody watches this key.
+        """
+        if key in self._watched:
+            self._see(key, function())
 
     def record_mean(self, key: str, value: float | None, exclude: object = None) -> None:
         """Record a value that is averaged over the epoch."""
@@ -46,6 +62,18 @@ class MetricLogger:
         self._sums[key] += value
         self._counts[key] += 1
         self.name_to_value[key] = self._sums[key] / self._counts[key]
+        if key in self._watched:
+            self._see(key, value)
+
+    def watch(self, keys: Iterable[str]) -> None:
+        """Remember the values of these keys, step by step; no keys: stop."""
+        self._watched = frozenset(keys)
+        self._seen = {}
+
+    def take_seen(self) -> dict[str, float]:
+        """Return the values of the watched keys that were recorded since the last call."""
+        seen, self._seen = self._seen, {}
+        return seen
 
     def take(self) -> dict[str, float]:
         """Return the numbers of this epoch and begin the next one.
@@ -61,6 +89,11 @@ class MetricLogger:
         self._sums.clear()
         self._counts.clear()
         return values
+
+    def _see(self, key: str, value: Any) -> None:
+        number = as_number(value)
+        if number is not None and math.isfinite(number):
+            self._seen[key] = number
 
     def state(self) -> dict[str, dict[str, Any]]:
         """Return what was recorded in the unfinished epoch, for a checkpoint."""

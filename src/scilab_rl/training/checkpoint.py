@@ -26,6 +26,8 @@ from scilab_rl.training.snapshot import Snapshot
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 _TENSORS, _STATE, _ARRAYS = "tensors.safetensors", "state.json", "arrays"
+# What reading somebody else's JSON can raise.
+_MALFORMED = (ValueError, KeyError, AttributeError, TypeError, RecursionError)
 _VERSIONED = ("torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
 
 
@@ -40,8 +42,9 @@ def save(
         step: Environment steps so far, for the manifest.
         about: More facts for the manifest.
     """
+    for abandoned in directory.parent.glob(".*.tmp/"):  # of a process that was killed
+        shutil.rmtree(abandoned, ignore_errors=True)
     unfinished = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
-    shutil.rmtree(unfinished, ignore_errors=True)
     (unfinished / _ARRAYS).mkdir(parents=True)
     try:
         _write_content(snapshot, unfinished)
@@ -57,15 +60,17 @@ def load(directory: Path) -> Snapshot:
     Raises:
         CheckpointError: If a file is missing, cut, changed or of another schema.
     """
-    verify(directory)
+    directory = _present(directory)
+    listed = verify(directory)["files"]
     try:
         stored = json.loads((directory / _STATE).read_text(encoding="utf-8"))
-        arrays = {
-            name: np.load(directory / _ARRAYS / file, mmap_mode="r", allow_pickle=False)
-            for name, file in stored["arrays"].items()
-        }
+        arrays = {}
+        for name, file in stored["arrays"].items():
+            if f"{_ARRAYS}/{file}" not in listed:
+                raise ValueError(f"its manifest does not list {file}")
+            arrays[name] = np.load(directory / _ARRAYS / file, mmap_mode="r", allow_pickle=False)
         return Snapshot(stored["tree"], load_file(directory / _TENSORS), arrays)
-    except (OSError, ValueError, KeyError, SafetensorError) as error:
+    except (OSError, *_MALFORMED, SafetensorError) as error:
         raise CheckpointError(f"'{directory}' cannot be read: {error}") from error
 
 
@@ -78,25 +83,35 @@ def verify(directory: Path) -> dict[str, Any]:
     _refuse_foreign_formats(directory)
     try:
         manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
-        entries = manifest["files"].items()
+        entries = [(name, fact["bytes"], fact["sha256"]) for name, fact in manifest["files"].items()]
         schema = manifest["schema_version"]
-    except (OSError, ValueError, KeyError, AttributeError, TypeError) as error:
+    except (OSError, *_MALFORMED) as error:
         raise CheckpointError(f"'{directory}' is no complete checkpoint: {error}") from error
     if schema != SCHEMA_VERSION:
         raise CheckpointError(
             f"'{directory}' has format {schema}; this version of Scilab-RL reads {SCHEMA_VERSION}."
         )
-    for name, expected in entries:
+    for name, n_bytes, digest in entries:
         path = directory / name
         if not path.resolve().is_relative_to(directory.resolve()) or not path.is_file():
             raise CheckpointError(f"'{directory}' is damaged: {name} is missing.")
-        if path.stat().st_size != expected["bytes"] or files.sha256(path) != expected["sha256"]:
+        if path.stat().st_size != n_bytes or files.sha256(path) != digest:
             raise CheckpointError(
                 f"'{directory}' is damaged: {name} has changed since it was saved."
             )
     if {_TENSORS, _STATE} - set(manifest["files"]):
         raise CheckpointError(f"'{directory}' is damaged: its manifest lists no state.")
     return manifest
+
+
+def _previous(directory: Path) -> Path:
+    return directory.with_name(f"{directory.name}.old")
+
+
+def _present(directory: Path) -> Path:
+    """Return the directory, or the older state of a process killed while it replaced this one."""
+    previous = _previous(directory)
+    return previous if not directory.exists() and previous.is_dir() else directory
 
 
 def _refuse_foreign_formats(directory: Path) -> None:
@@ -115,6 +130,8 @@ def _write_content(snapshot: Snapshot, directory: Path) -> None:
         for name, tensor in snapshot.tensors.items()
     }
     save_file(tensors, directory / _TENSORS)
+    with (directory / _TENSORS).open("rb") as file:
+        os.fsync(file.fileno())
     names = {}
     for index, (name, array) in enumerate(snapshot.arrays.items()):
         names[name] = f"{index}.npy"
@@ -158,9 +175,9 @@ def _versions() -> dict[str, str]:
 def _swap(finished: Path, directory: Path) -> None:
     """Put the finished directory in its place; a directory cannot replace a full one in one step.
 
-    Between the two renames the older state lies under ``<name>.old``, where `load_latest` finds it.
+    Between the two renames the older state lies under ``<name>.old``, where `load` finds it.
     """
-    previous = directory.with_name(f"{directory.name}.old")
+    previous = _previous(directory)
     if directory.exists():
         shutil.rmtree(previous, ignore_errors=True)
         directory.rename(previous)

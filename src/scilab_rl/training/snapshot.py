@@ -16,7 +16,7 @@ import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -31,6 +31,16 @@ from scilab_rl.metrics.logger import MetricLogger
 Node = Any  # JSON: a plain value, or {"@kind": ...}
 
 _OPEN_PACKAGES = ("stable_baselines3", "sb3_contrib", "scilab_rl", "custom_algorithms")
+# What a module may keep beside its parameters and buffers: counters, running means, exploration.
+_KEPT_IN_MODULES = (
+    bool,
+    int,
+    float,
+    np.ndarray,
+    torch.Tensor,
+    np.random.Generator,
+    torch.optim.Optimizer,
+)
 _CLOSED = (VecEnv, gym.Env, MetricLogger, BaseCallback, torch.device, torch.dtype, type)
 
 
@@ -82,7 +92,7 @@ def restore(state: dict[str, Any], snapshot: Snapshot) -> dict[str, Any]:
             for name, node in snapshot.tree.items()
             if name in state
         }
-    except (KeyError, IndexError, TypeError, ValueError, RuntimeError) as error:
+    except (AttributeError, LookupError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(f"The saved state does not fit this algorithm: {error}") from error
 
 
@@ -116,6 +126,13 @@ def _packages_of(state: dict[str, Any]) -> tuple[str, ...]:
     return (*_OPEN_PACKAGES, *(own - {"builtins", "numpy", "torch", "collections"}))
 
 
+class Rows(NamedTuple):
+    """How many rows of a replay buffer's arrays hold something, and how many there are."""
+
+    filled: int
+    capacity: int
+
+
 class _Capture:
     def __init__(self, snapshot: Snapshot, with_buffers: bool, packages: tuple[str, ...]) -> None:
         self.snapshot = snapshot
@@ -123,8 +140,8 @@ class _Capture:
         self.packages = packages
         self.seen: set[int] = set()
 
-    def describe(self, value: Any, path: str, rows: int | None = None) -> Node:
-        """Describe one value; ``rows`` is the filled length of the buffer it belongs to."""
+    def describe(self, value: Any, path: str, rows: Rows | None = None) -> Node:
+        """Describe one value; ``rows`` tells how full the replay buffer is that it belongs to."""
         if value is None or isinstance(value, (bool, int, float, str)):
             return value
         if isinstance(value, np.generic):
@@ -149,6 +166,7 @@ class _Capture:
         return [
             (torch.nn.Module, self._module),
             (torch.optim.Optimizer, self._optimizer),
+            (torch.optim.lr_scheduler.LRScheduler, self._scheduler),
             (
                 np.random.Generator,
                 lambda g, _: {"@kind": "generator", "state": g.bit_generator.state},
@@ -165,13 +183,16 @@ class _Capture:
         self.snapshot.tensors[path] = value.detach()
         return {"@kind": "tensor", "name": path}
 
-    def _array(self, value: np.ndarray, path: str, rows: int | None) -> Node:
+    def _array(self, value: np.ndarray, path: str, rows: Rows | None) -> Node:
         if value.dtype.hasobject:
             return {"@kind": "skip"}
-        self.snapshot.arrays[path] = value if rows is None else value[:rows]
-        return {"@kind": "array", "name": path}
+        if rows is None or value.shape[:1] != (rows.capacity,):
+            self.snapshot.arrays[path] = value
+            return {"@kind": "array", "name": path}
+        self.snapshot.arrays[path] = value[: rows.filled]
+        return {"@kind": "rows", "name": path}
 
-    def _container(self, value: Any, path: str, rows: int | None) -> Node:
+    def _container(self, value: Any, path: str, rows: Rows | None) -> Node:
         if isinstance(value, dict):
             entries: Any = {
                 str(key): self.describe(entry, f"{path}.{key}", rows)
@@ -190,14 +211,14 @@ class _Capture:
             if isinstance(tensor, torch.Tensor):
                 self._tensor(tensor, f"{path}.{name}")
                 names.append(name)
-        optimizers = {}
+        attributes = {}
         for name, part in module.named_modules():
             self.seen.add(id(part))
             for attribute, value in vars(part).items():
-                if isinstance(value, torch.optim.Optimizer) and id(value) not in self.seen:
+                if isinstance(value, _KEPT_IN_MODULES):
                     key = f"{name}.{attribute}".lstrip(".")
-                    optimizers[key] = self.describe(value, f"{path}.{key}")
-        return {"@kind": "module", "path": path, "names": names, "optimizers": optimizers}
+                    attributes[key] = self.describe(value, f"{path}.{key}")
+        return {"@kind": "module", "path": path, "names": names, "attributes": attributes}
 
     def _optimizer(self, optimizer: torch.optim.Optimizer, path: str) -> Node:
         state = optimizer.state_dict()
@@ -207,6 +228,9 @@ class _Capture:
             "state": self.describe(state["state"], f"{path}.state"),
         }
 
+    def _scheduler(self, scheduler: torch.optim.lr_scheduler.LRScheduler, path: str) -> Node:
+        return {"@kind": "scheduler", "state": self.describe(scheduler.state_dict(), path)}
+
     def _space(self, space: gym.Space, path: str) -> Node:
         return {"@kind": "space", "state": space.np_random.bit_generator.state}
 
@@ -215,14 +239,13 @@ class _Capture:
             return {"@kind": "skip"}
         if not self.with_buffers:
             return {"@kind": "skip"}
-        rows = buffer.buffer_size if buffer.full else buffer.pos
-        return self._object(buffer, path, rows)
+        filled = buffer.buffer_size if buffer.full else buffer.pos
+        return self._object(buffer, path, Rows(filled, buffer.buffer_size))
 
-    def _object(self, value: Any, path: str, rows: int | None = None) -> Node:
+    def _object(self, value: Any, path: str, rows: Rows | None = None) -> Node:
         attributes = {
             name: self.describe(attribute, f"{path}.{name}", rows)
             for name, attribute in vars(value).items()
-            if not callable(attribute) or isinstance(attribute, torch.nn.Module)
         }
         kept = {name: node for name, node in attributes.items() if node != {"@kind": "skip"}}
         return {"@kind": "object", "attributes": kept}
@@ -244,23 +267,21 @@ class _Restore:
     def _put_tensor(self, current: Any, node: Node) -> Any:
         saved = self.snapshot.tensors[node["name"]]
         if isinstance(current, torch.Tensor):
-            with torch.no_grad():
-                current.copy_(saved)
-            return current
+            if current.shape == saved.shape:
+                with torch.no_grad():
+                    return current.copy_(saved)
+            if current.requires_grad:  # an optimizer holds on to it
+                raise ValueError(f"{node['name']} has shape {_shape(saved)}, not {_shape(current)}")
         return saved.clone()
 
-    def _put_array(self, current: Any, node: Node) -> Any:
+    def _put_array(self, current: Any, node: Node) -> np.ndarray:
+        return np.array(self.snapshot.arrays[node["name"]])
+
+    def _put_rows(self, current: Any, node: Node) -> np.ndarray:
+        """Fill the array in place: a replay buffer is too large to exist twice."""
         saved = self.snapshot.arrays[node["name"]]
-        fits = (
-            isinstance(current, np.ndarray)
-            and current.flags.writeable
-            and current.ndim == saved.ndim > 0
-            and current.dtype == saved.dtype
-            and current.shape[1:] == saved.shape[1:]
-            and len(saved) <= len(current)
-        )
-        if not fits:
-            return np.array(saved)
+        if current.shape[1:] != saved.shape[1:] or len(current) < len(saved):
+            raise ValueError(f"{node['name']} has shape {_shape(saved)}, not {_shape(current)}")
         current[: len(saved)] = saved
         return current
 
@@ -298,9 +319,10 @@ class _Restore:
         missing = set(current.state_dict()) - set(saved)
         if any(isinstance(current.state_dict()[name], torch.Tensor) for name in missing):
             raise KeyError(f"no saved values for {sorted(missing)}")
-        for key, optimizer in node["optimizers"].items():
+        for key, entry in node["attributes"].items():
             owner, _, attribute = key.rpartition(".")
-            self.put(getattr(current.get_submodule(owner), attribute), optimizer)
+            part = current.get_submodule(owner)
+            setattr(part, attribute, self.put(getattr(part, attribute), entry))
         return current
 
     def _put_optimizer(self, current: torch.optim.Optimizer, node: Node) -> torch.optim.Optimizer:
@@ -309,6 +331,12 @@ class _Restore:
         current.load_state_dict(
             {"param_groups": groups, "state": {int(index): entry for index, entry in state.items()}}
         )
+        return current
+
+    def _put_scheduler(
+        self, current: torch.optim.lr_scheduler.LRScheduler, node: Node
+    ) -> torch.optim.lr_scheduler.LRScheduler:
+        current.load_state_dict(self.put(None, node["state"]))
         return current
 
     def _put_generator(self, current: np.random.Generator, node: Node) -> np.random.Generator:
@@ -329,6 +357,10 @@ class _Restore:
             if name in attributes:
                 setattr(current, name, self.put(attributes[name], entry))
         return current
+
+
+def _shape(value: Any) -> tuple[int, ...]:
+    return tuple(value.shape)
 
 
 def _is_named_tuple(value: Any) -> bool:

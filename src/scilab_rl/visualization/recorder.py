@@ -23,7 +23,9 @@ class EpisodeRecorder:
         on_video: Called with the path of each finished video.
     """
 
-    def __init__(self, env: ObservedVecEnv, on_video: Callable[[Path], object] | None = None) -> None:
+    def __init__(
+        self, env: ObservedVecEnv, on_video: Callable[[Path], object] | None = None
+    ) -> None:
         self.env = env
         self.on_video = on_video
         self.fps = float(env.get_attr("metadata")[0].get("render_fps") or DEFAULT_FPS)

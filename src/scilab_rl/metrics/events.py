@@ -1,0 +1,45 @@
+"""Moments of an episode worth finding again."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+FALL_METRES = 0.2  # a Fetch block on the floor is 0.4 m lower, a gripper cannot go as deep as 0.2 m
+
+
+class EpisodeEvents:
+    """Says what can be seen in each scene of an episode for the first time."""
+
+    def __init__(self) -> None:
+        self._first_heights: np.ndarray | None = None
+        self._succeeded = False
+        self._fell = False
+
+    def of_scene(self, observation: Any, success: bool | None) -> list[str]:
+        """Return the events of a scene.
+
+        Args:
+            observation: What the agent sees.
+            success: Whether the step before led to success; None for the first scene.
+        """
+        events = ["episode start"] if self._first_heights is None else []
+        heights = _heights(observation)
+        if self._first_heights is None:
+            self._first_heights = heights
+        if success is not None and success != self._succeeded:
+            events.append("success" if success else "success lost")
+            self._succeeded = success
+        if not self._fell and np.any(self._first_heights - heights > FALL_METRES):
+            events.append("object fell")
+            self._fell = True
+        return events
+
+
+def _heights(observation: Any) -> np.ndarray:
+    """Return the heights of the achieved goal's places in space, if that is what it consists of."""
+    if not isinstance(observation, dict) or "achieved_goal" not in observation:
+        return np.zeros(0)
+    places = np.asarray(observation["achieved_goal"], dtype=np.float64).ravel()
+    return places[2::3] if len(places) and len(places) % 3 == 0 else np.zeros(0)

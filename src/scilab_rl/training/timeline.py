@@ -1,0 +1,249 @@
+"""The one place where frames and metrics are joined: by phase, environment, episode and step."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from scilab_rl.algorithms.inspection import Inspection
+from scilab_rl.envs.observed import ObservedVecEnv, StepBatch
+from scilab_rl.metrics.events import EpisodeEvents
+from scilab_rl.metrics.logger import MetricLogger
+from scilab_rl.metrics.probes import EpisodeProbes, ShownMetrics
+from scilab_rl.metrics.success import success_of
+from scilab_rl.visualization.records import ClipInfo, Record, encode_picture
+
+_log = logging.getLogger(__name__)
+_ENV = 0  # the environment that is shown
+
+
+class RecordSink(Protocol):
+    """Somebody who shows or keeps records."""
+
+    def begin(self, clip: ClipInfo) -> None:
+        """Begin a clip."""
+
+    def add(self, record: Record) -> None:
+        """Take the next scene."""
+
+    def end(self) -> None:
+        """Finish the clip."""
+
+
+class Timeline:
+    """Observes the steps of an environment and makes a record of each scene that is shown.
+
+    Steps that nobody watches cost one comparison. `records` says which numbers belong to
+    which frame. Nothing that goes wrong here ends the training.
+
+    Args:
+        env: The environments; made with ``render_mode="rgb_array"``.
+        mind: The algorithm.
+        metrics: What is shown.
+        describe: Returns what a clip is about, given its epoch and first episode.
+        sinks: Where the records go.
+        frames_per_clip: Scenes of a clip, over as many episodes as it takes; 0: one episode.
+        logger: What the algorithm records to. With a logger, a step is complete only when
+            `complete_step` says so, because algorithms record also after ``env.step``.
+    """
+
+    def __init__(
+        self,
+        env: ObservedVecEnv,
+        mind: Inspection,
+        metrics: ShownMetrics,
+        describe: Callable[[int, int], ClipInfo],
+        sinks: Sequence[RecordSink],
+        *,
+        frames_per_clip: int = 0,
+        logger: MetricLogger | None = None,
+    ) -> None:
+        self.env = env
+        self.mind = mind
+        self.metrics = metrics
+        self.describe = describe
+        self.sinks = list(sinks)
+        self.frames_per_clip = frames_per_clip
+        self.logger = logger
+        self._clips_wanted = 0
+        self._epoch = 0
+        self._n_scenes: int | None = None  # of the running clip; None between clips
+        self._scene: tuple[np.ndarray | None, np.ndarray | None] = (None, None)
+        self._last_success: bool | None = None
+        self._pending: list[Record] = []
+        self._warned: set[str] = set()
+        env.observers.append(self)
+
+    def show(self, epoch: int, n_clips: int = 1) -> None:
+        """Show the next clips, from the next episode on.
+
+        Args:
+            epoch: Number of the epoch, from 1.
+            n_clips: How many; those of an earlier call that have not begun are dropped.
+        """
+        self._epoch = epoch
+        if self._n_scenes is not None:
+            return
+        self._clips_wanted = n_clips
+        self.env.env_method("capture_frames", True, indices=[_ENV])
+        if self.logger is not None:
+            self.logger.watch(self.metrics.recorded)
+
+    def on_step(self, batch: StepBatch) -> None:
+        """Make the record of this step, if it is shown."""
+        if not self._clips_wanted:
+            return
+        self.complete_step()
+        if batch.episode_steps[_ENV] == 0:
+            self._begin_episode(batch)
+        if self._n_scenes is None:
+            return
+        with self.mind.undisturbed():
+            self._add_scenes(batch)
+        if self.logger is None:
+            self.complete_step()
+
+    def complete_step(self) -> None:
+        """Hear that all has been recorded that belongs to the last step."""
+        if not self._clips_wanted:
+            return
+        seen = self.logger.take_seen() if self.logger is not None else {}
+        if not self._pending:
+            return
+        records, self._pending = self._pending, []
+        records[0].values |= seen
+        for record in records:
+            self._send(record)
+        if self._n_scenes is None:
+            return
+        if self._clip_is_full(records[-1]):
+            self._end_clip()
+
+    def close(self) -> None:
+        """Finish the clip that is running, if any."""
+        self.complete_step()
+        if self._n_scenes is not None:
+            self._end_clip()
+
+    def _begin_episode(self, batch: StepBatch) -> None:
+        self._scene = (self.env.reset_frame, self.env.reset_state)
+        if self._scene[0] is None:  # captured from the next reset on
+            return
+        self._probes = EpisodeProbes(self.mind, self.metrics.probes, self._warn_once)
+        self._events = EpisodeEvents()
+        self._last_success = None
+        if self._n_scenes is None:
+            self._n_scenes = 0
+            clip = self.describe(self._epoch, int(batch.episodes[_ENV]))
+            self._tell("begin", clip)
+
+    def _add_scenes(self, batch: StepBatch) -> None:
+        record = self._record(batch)
+        if record is None:
+            self._stop_without_frames(batch)
+            return
+        self._pending = [record]
+        self._scene = (batch.frames[_ENV], batch.states[_ENV])
+        if batch.dones[_ENV] and (last := self._last_scene(batch)) is not None:
+            self._pending.append(last)
+
+    def _record(self, batch: StepBatch) -> Record | None:
+        frame, state = self._scene
+        if frame is None:
+            return None
+        done, info = bool(batch.dones[_ENV]), batch.infos[_ENV]
+        observation = _entry(batch.observations)
+        next_observation = info["terminal_observation"] if done else _entry(batch.next_observations)
+        action, reward = np.array(batch.actions[_ENV]), float(batch.rewards[_ENV])
+        truncated = done and bool(info.get("TimeLimit.truncated", False))
+        record = Record(
+            batch.phase,
+            _ENV,
+            int(batch.episodes[_ENV]),
+            int(batch.episode_steps[_ENV]),
+            batch.step - self.env.num_envs,
+            encode_picture(frame),
+            observation,
+            action,
+            reward,
+            done and not truncated,
+            truncated,
+            success_of(info),
+            state,
+            self._probes.of_step(observation, action, reward, next_observation, info, done),
+            self._events.of_scene(observation, self._last_success),
+        )
+        self._last_success = record.success
+        return record
+
+    def _last_scene(self, batch: StepBatch) -> Record | None:
+        frame, state = self._scene
+        if frame is None:
+            return None
+        observation = batch.infos[_ENV]["terminal_observation"]
+        return Record(
+            batch.phase,
+            _ENV,
+            int(batch.episodes[_ENV]),
+            int(batch.episode_steps[_ENV]) + 1,
+            batch.step,
+            encode_picture(frame),
+            observation,
+            state=state,
+            values=self._probes.of_scene(observation),
+            events=self._events.of_scene(observation, self._last_success),
+        )
+
+    def _clip_is_full(self, last: Record) -> bool:
+        if self.frames_per_clip:
+            return (self._n_scenes or 0) >= self.frames_per_clip
+        return last.is_last_scene
+
+    def _send(self, record: Record) -> None:
+        if self._n_scenes is None or (
+            self.frames_per_clip and self._n_scenes >= self.frames_per_clip
+        ):
+            return
+        self._n_scenes += 1
+        self._tell("add", record)
+
+    def _end_clip(self) -> None:
+        self._n_scenes = None
+        self._clips_wanted -= 1
+        self._tell("end")
+        if not self._clips_wanted:
+            self.env.env_method("capture_frames", False, indices=[_ENV])
+            if self.logger is not None:
+                self.logger.watch(())
+
+    def _stop_without_frames(self, batch: StepBatch) -> None:
+        self._warn_once(
+            f"There are no more pictures from {batch.phase} step {batch.step} on; the clip ends there."
+        )
+        self._clips_wanted = 1
+        self._end_clip()
+
+    def _tell(self, what: str, *arguments: Any) -> None:
+        for sink in list(self.sinks):
+            try:
+                getattr(sink, what)(*arguments)
+            except Exception as error:  # noqa: BLE001 - showing must not end the training
+                self.sinks.remove(sink)
+                self._warn_once(
+                    f"{type(sink).__name__} is switched off: {type(error).__name__}: {error}. "
+                    "Training goes on."
+                )
+
+    def _warn_once(self, message: str) -> None:
+        if message not in self._warned:
+            self._warned.add(message)
+            _log.warning(message)
+
+
+def _entry(observations: Any) -> Any:
+    if isinstance(observations, dict):
+        return {key: np.array(value[_ENV]) for key, value in observations.items()}
+    return np.array(observations[_ENV])
