@@ -102,7 +102,7 @@ def test_restored_policy_acts_as_the_saved_one(finished_run: Path) -> None:
     assert _weights(last_run(finished_run)) == _weights(Path(wanted["run_dir"]), finished_run)
 
 
-@pytest.mark.parametrize("algorithm", ["sac", "ppo"])
+@pytest.mark.parametrize("algorithm", ["sac", "cleansac", "ppo"])
 def test_killed_and_resumed_equals_uninterrupted(algorithm: str, tmp_path: Path) -> None:
     """Killed with SIGKILL in the middle of an epoch: weights and metrics end the same, bit for bit."""
     arguments = [f"algorithm={algorithm}", TINY, "n_envs=2", *QUICK, "save_model_freq=60"]

@@ -10,7 +10,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
 from scilab_rl.envs.frames import FRAME_KEY, STATE_KEY
-from scilab_rl.errors import EnvironmentError_, ScilabRLError
+from scilab_rl.errors import EnvironmentError_, NumericalError, ScilabRLError
 from scilab_rl.metrics.success import success_of as success_of
 
 Observation = np.ndarray | dict[str, np.ndarray]
@@ -98,8 +98,17 @@ class ObservedVecEnv(VecEnvWrapper):
         return self._observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Begin a step."""
+        """Begin a step.
+
+        Raises:
+            NumericalError: If an action is not finite; a simulator would fail in its own words.
+        """
         self._actions = actions
+        if np.issubdtype(actions.dtype, np.floating) and not np.isfinite(actions).all():
+            raise NumericalError(
+                f"The agent's action is {actions.tolist()} at {self.phase} step {self.step_count}: "
+                "its weights are not finite. Often the learning rate is too high."
+            )
         with self._errors_named("step"):
             self.venv.step_async(actions)
 

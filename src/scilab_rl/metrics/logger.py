@@ -80,11 +80,7 @@ class MetricLogger:
 
         What is not a number (text, images, histograms of other frameworks) is left out.
         """
-        values = {
-            key: number
-            for key, value in self.name_to_value.items()
-            if (number := as_number(value)) is not None
-        }
+        values = self._numbers()
         self.name_to_value.clear()
         self._sums.clear()
         self._counts.clear()
@@ -95,10 +91,17 @@ class MetricLogger:
         if number is not None and math.isfinite(number):
             self._seen[key] = number
 
+    def _numbers(self) -> dict[str, float]:
+        return {
+            key: number
+            for key, value in self.name_to_value.items()
+            if (number := as_number(value)) is not None
+        }
+
     def state(self) -> dict[str, dict[str, Any]]:
         """Return what was recorded in the unfinished epoch, for a checkpoint."""
         return {
-            "values": self.name_to_value,
+            "values": self._numbers(),
             "sums": dict(self._sums),
             "counts": dict(self._counts),
         }

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
@@ -149,6 +150,8 @@ class Trainer(BaseCallback):
         values = self._training_metrics(training_seconds)
         values |= self._evaluate()
         self._refuse_nan(values)
+        # What is not defined in an epoch, such as the explained variance of equal returns, is a gap.
+        values = {name: value for name, value in values.items() if math.isfinite(value)}
         self.store.append(self.num_timesteps, values)
         self._keep_if_best(values)
         self.trackers.epoch(self.num_timesteps, self.n_epochs_done, values)
@@ -184,12 +187,24 @@ class Trainer(BaseCallback):
         return evaluation.metrics() | {"time/eval_seconds": time.monotonic() - started}
 
     def _refuse_nan(self, values: Mapping[str, float]) -> None:
-        for name, value in values.items():
-            if name.startswith(("train/", "eval/")) and not math.isfinite(value):
-                raise NumericalError(
-                    f"{name} is {value} after {self.num_timesteps} steps "
-                    f"({_hyperparameters(self.model)}). Often the learning rate is too high."
-                )
+        """Stop a run whose losses or weights are no numbers: all that follows would be noise."""
+        broken = {
+            name: value
+            for name, value in values.items()
+            if ("loss" in name or name.startswith("eval/")) and not math.isfinite(value)
+        }
+        policy = getattr(self.model, "policy", None)
+        if isinstance(policy, torch.nn.Module):
+            broken |= {
+                f"weight {name}": math.nan
+                for name, weight in policy.named_parameters()
+                if not torch.isfinite(weight).all()
+            }
+        for name, value in broken.items():
+            raise NumericalError(
+                f"{name} is {value} after {self.num_timesteps} steps "
+                f"({_hyperparameters(self.model)}). Often the learning rate is too high."
+            )
 
     def _keep_if_best(self, values: Mapping[str, float]) -> None:
         candidate = (values.get("eval/success_rate", 0.0), values["eval/mean_reward"])
