@@ -34,8 +34,8 @@ class OrphanedOptimizer(A2C):
 class HiddenState(A2C):
     """Learns faster and faster, by a number that no checkpoint sees."""
 
-    def __init__(self, *args, **kwargs):
-        super().__init__(*args, **kwargs)
+    def _setup_model(self):
+        super()._setup_model()
         rounds = [0]
 
         def scaled(_):

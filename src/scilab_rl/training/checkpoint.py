@@ -83,7 +83,9 @@ def verify(directory: Path) -> dict[str, Any]:
     _refuse_foreign_formats(directory)
     try:
         manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
-        entries = [(name, fact["bytes"], fact["sha256"]) for name, fact in manifest["files"].items()]
+        entries = [
+            (name, fact["bytes"], fact["sha256"]) for name, fact in manifest["files"].items()
+        ]
         schema = manifest["schema_version"]
     except (OSError, *_MALFORMED) as error:
         raise CheckpointError(f"'{directory}' is no complete checkpoint: {error}") from error

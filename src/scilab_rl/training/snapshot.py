@@ -99,7 +99,7 @@ def restore(state: dict[str, Any], snapshot: Snapshot) -> dict[str, Any]:
 def random_state() -> dict[str, Any]:
     """Return the state of the global generators of Python, NumPy and PyTorch."""
     version, words, gauss = random.getstate()
-    kind, keys, position, has_gauss, cached = np.random.get_state()  # type: ignore[misc]
+    kind, keys, position, has_gauss, cached = np.random.get_state()
     state: dict[str, Any] = {
         "python": [version, list(words), gauss],
         "numpy": [kind, np.asarray(keys), position, has_gauss, cached],
@@ -275,7 +275,12 @@ class _Restore:
         return saved.clone()
 
     def _put_array(self, current: Any, node: Node) -> np.ndarray:
-        return np.array(self.snapshot.arrays[node["name"]])
+        saved = self.snapshot.arrays[node["name"]]
+        if isinstance(current, np.ndarray) and current.flags.writeable:
+            if (current.shape, current.dtype) == (saved.shape, saved.dtype):
+                current[...] = saved
+                return current
+        return np.array(saved)
 
     def _put_rows(self, current: Any, node: Node) -> np.ndarray:
         """Fill the array in place: a replay buffer is too large to exist twice."""
