@@ -307,13 +307,14 @@ class OneFileAlgorithm(ABC):
         values = actions.cpu().numpy()
         space = self.action_space
         if isinstance(space, spaces.Discrete):
-            return values + space.start
+            return values.reshape(-1) + space.start
+        if not isinstance(space, spaces.Box):
+            return values
         if not np.isfinite(values).all():
             raise NumericalError(
                 f"An action of the policy is {values.flatten().tolist()} after {self.n_updates} "
                 "updates: its weights are not finite. Often the learning rate is too high."
             )
-        assert isinstance(space, spaces.Box)
         values = values.reshape(-1, *space.shape)
         scaled = space.low + 0.5 * (values + 1.0) * (space.high - space.low)
         return np.clip(scaled, space.low, space.high).astype(space.dtype)
@@ -327,13 +328,14 @@ class OneFileAlgorithm(ABC):
         space = self.action_space
         if isinstance(space, spaces.Discrete):
             return np.asarray(actions).reshape(-1, 1) - space.start
-        assert isinstance(space, spaces.Box)
+        if not isinstance(space, spaces.Box):
+            return np.asarray(actions)
         scaled = 2.0 * (np.asarray(actions) - space.low) / (space.high - space.low) - 1.0
         return scaled.reshape(len(scaled), -1).astype(np.float32)
 
-    def sample_env_actions(self) -> np.ndarray:
-        """Draw a random action of the environment's for each environment."""
-        return np.array([self.action_space.sample() for _ in range(self.n_envs)])
+    def sample_env_actions(self, n: int | None = None) -> np.ndarray:
+        """Draw ``n`` random actions of the environment's; by default one per environment."""
+        return np.array([self.action_space.sample() for _ in range(n or self.n_envs)])
 
     def record_losses(self, losses: Mapping[str, Sequence[torch.Tensor]]) -> None:
         """Record the mean of each loss as ``train/<name>``, and refuse what is not finite.

@@ -26,7 +26,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -212,15 +212,10 @@ class CLEANPPO(OneFileAlgorithm):
     def train(self, rollout: Rollout) -> None:
         """Improve policy and value function in minibatches, ``n_epochs`` times over the rollout."""
         records: dict[str, list[Tensor]] = defaultdict(list)
-        for _ in range(self.n_epochs):
-            order = torch.randperm(len(rollout.actions), device=self.device)
-            for indices in order.split(self.batch_size):
-                batch = Rollout(*(part[indices] for part in rollout))
-                if not self._update(batch, records):
-                    break
-            else:
-                continue
-            break
+        for indices in minibatches(len(rollout.actions), self.batch_size, self.n_epochs):
+            batch = Rollout(*(part[indices.to(self.device)] for part in rollout))
+            if not self._update(batch, records):
+                break
         variance = explained_variance(rollout.values, rollout.returns)
         self.record_losses(records)
         self.logger.record("train/explained_variance", variance)
@@ -293,6 +288,12 @@ def tanh_network(sizes: Sequence[int], last_gain: float) -> nn.Sequential:
         layers += [linear, nn.Tanh()]
     nn.init.orthogonal_(layers[-2].weight, last_gain)
     return nn.Sequential(*layers[:-1])
+
+
+def minibatches(n: int, batch_size: int, n_epochs: int) -> Iterator[Tensor]:
+    """Yield the indices of each minibatch; in each epoch, each index comes once."""
+    for _ in range(n_epochs):
+        yield from torch.randperm(n).split(batch_size)
 
 
 def generalized_advantages(
