@@ -1,0 +1,37 @@
+"""A wheel in an empty folder: no desk, no repository, and still the whole command line."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+from .commands import QUICK, ROOT, TINY, last_run, quiet_environment
+
+
+def test_wheel_trains_in_an_empty_folder(tmp_path: Path) -> None:
+    site, desk = tmp_path / "site", tmp_path / "desk"
+    desk.mkdir()
+    copy = tmp_path / "source"
+    subprocess.run(
+        ["git", "-c", "safe.directory=*", "clone", "--quiet", "--local", str(ROOT), str(copy)],
+        check=True,
+    )
+    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
+    offline = ["--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run(
+        [*pip, "install", *offline, "--target", str(site), str(copy)], check=True, cwd=tmp_path
+    )
+    assert not (site / "custom_algorithms").exists(), "the desk belongs to the researcher"
+    assert (site / "scilab_rl" / "conf" / "main.yaml").is_file()
+    done = subprocess.run(
+        [sys.executable, "-m", "scilab_rl.cli", "algorithm=sac", TINY, *QUICK, "n_epochs=1"],
+        cwd=desk,
+        env=quiet_environment(PYTHONPATH=str(site)),
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Warning" not in done.stderr
+    assert (last_run(desk) / "rl_model_finished" / "manifest.json").is_file()
