@@ -114,7 +114,7 @@ _TRUSTED = (
     "stable_baselines3.", "sb3_contrib.", "gymnasium.", "gymnasium_robotics.", "torch.nn.",
 )  # fmt: skip
 _FLATTEN = {"_target_": "gymnasium.wrappers.FlattenObservation"}
-_CLIP = {"_target_": "gymnasium.wrappers.ClipAction"}
+_CLIP = {"_target_": "scilab_rl.envs.clipping.ClipAction"}
 _TIME = {"_target_": "gymnasium.wrappers.TimeAwareObservation"}
 _NORMALIZE = "stable_baselines3.common.vec_env.VecNormalize"
 ALIASES = (

@@ -24,7 +24,7 @@ from scilab_rl.envs.frames import FrameCapture
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.envs.replayable import ReplayableEpisode
-from scilab_rl.errors import ConfigError, EnvironmentError_, did_you_mean
+from scilab_rl.errors import ConfigError, EnvironmentError_, ScilabRLError, did_you_mean
 from scilab_rl.seeding import derive_seed
 
 Wrapper = Callable[..., Any]
@@ -87,6 +87,8 @@ def make_single_env(settings: EnvSettings) -> gym.Env:
                 env = wrapper(env)
         if settings.render_mode == "rgb_array":
             env = FrameCapture(env)
+    except ScilabRLError:
+        raise
     except TypeError as error:
         raise ConfigError(_explain_type_error(settings, error)) from error
     except Exception as error:
