@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import math
+import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -150,6 +151,11 @@ def compose(overrides: Sequence[str]) -> DictConfig:
         tuned = tuned_option(cfg)
         if tuned is None:
             return cfg
+        _log.info(
+            "Tuned values for %s are used: %s (off with tuned=false).",
+            tuned.replace("/", " with "),
+            os.path.relpath(config_files("tuned_values")[tuned]),
+        )
         return hydra.compose("main", overrides=[f"+tuned_values={tuned}", *overrides])
     except Exception as error:
         raise explain_error(error) from error
