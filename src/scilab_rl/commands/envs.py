@@ -108,8 +108,8 @@ def space_text(space: Any) -> str:
         return ", ".join(f"{key}: {space_text(entry)}" for key, entry in space.spaces.items())
     if not isinstance(space, spaces.Box):
         return str(space)
-    low, high = space.low.min(initial=0), space.high.max(initial=0)
-    bounds = f" from {low:g} to {high:g}" if space.is_bounded() else ""
+    has_bounds = space.is_bounded() and space.low.size > 0
+    bounds = f" from {space.low.min():g} to {space.high.max():g}" if has_bounds else ""
     return f"Box({', '.join(map(str, space.shape))}){bounds}"
 
 

@@ -12,14 +12,20 @@ from scilab_rl.results import CONFIG_FILE, RunDirectory, RunResult
 
 @pytest.fixture
 def desk(tmp_path, monkeypatch):
-    """An empty folder to work in; what is imported from it is forgotten afterwards."""
+    """A folder to work in; what is imported from it is forgotten afterwards."""
+    (tmp_path / "conf").mkdir()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
-    before = set(sys.modules)
+    for name in own_modules():
+        monkeypatch.delitem(sys.modules, name)
     yield tmp_path
-    for name in set(sys.modules) - before:
-        if name.partition(".")[0].startswith("custom_"):
-            del sys.modules[name]
+    for name in own_modules():
+        del sys.modules[name]
+
+
+def own_modules() -> list[str]:
+    """Return the imported modules of a desk, this repository's or a test's."""
+    return [name for name in sys.modules if name.startswith("custom_")]
 
 
 @pytest.fixture
@@ -39,7 +45,7 @@ def make_run(tmp_path):
     return make
 
 
-def write_yaml(path: Path, text: str) -> None:
+def write_file(path: Path, text: str) -> None:
     """Write a file of the desk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text, encoding="utf-8")

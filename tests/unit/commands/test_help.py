@@ -42,7 +42,7 @@ def test_all_commands_keys_and_wrappers_are_explained(text):
 @pytest.mark.parametrize(
     "line",
     [
-        r"algorithm=sac +what learns: a2c, .*",
+        r"algorithm=\w+ +what learns: \w+, .*",
         r"n_epochs=60 +most epochs \(whole number from 1\)",
         r"tuned=true +.*",
         r"info='' +a note .*",
