@@ -52,6 +52,14 @@ def run_command_line(arguments: list[str]) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `scilab-rl runs | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE_CLOSED
+    except Exception as error:  # noqa: BLE001 - a newcomer gets one line here too
+        if debug:
+            raise
+        message = " ".join(str(error).split())
+        sys.stderr.write(
+            f"error: {type(error).__name__}: {message} (unexpected; --debug shows the traceback)\n"
+        )
+        return 1
 
 
 def _dispatch(arguments: list[str]) -> int:

@@ -23,7 +23,7 @@ from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
 from scilab_rl.errors import ConfigError, did_you_mean, listing
-from scilab_rl.workspace import config_files
+from scilab_rl.workspace import SHIPPED_CONF, config_files
 
 _log = logging.getLogger(__name__)
 
@@ -177,9 +177,16 @@ def load_recorded(path: Path, overrides: Sequence[str] = ()) -> DictConfig:
         assert isinstance(cfg, DictConfig)
         refuse_foreign_code(OmegaConf.to_container(cfg, resolve=False), path)
         changes = OmegaConf.from_dotlist([override.lstrip("+") for override in overrides])
-        return OmegaConf.merge(cfg, changes)  # type: ignore[return-value]
+        # Keys that are newer than the run get their default.
+        return OmegaConf.merge(_defaults(), cfg, changes)  # type: ignore[return-value]
     except (OSError, AssertionError, ValueError, OmegaConfBaseException, yaml.YAMLError) as error:
         raise explain_error(error) from error
+
+
+def _defaults() -> DictConfig:
+    cfg = OmegaConf.load(SHIPPED_CONF / "main.yaml")
+    assert isinstance(cfg, DictConfig)
+    return OmegaConf.masked_copy(cfg, [key for key in cfg if key not in ("defaults", "hydra")])
 
 
 def refuse_foreign_code(value: Any, path: Path) -> None:
