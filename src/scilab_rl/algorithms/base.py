@@ -397,7 +397,8 @@ class LazyNumber:
 
     def item(self) -> float:
         """Return the number."""
-        return float(self.compute())
+        with torch.no_grad():
+            return float(self.compute())
 
 
 def _end_running_episodes(buffer: HerReplayBuffer) -> None:
