@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-EXTRAS := dev,mlflow,wandb,tensorboard
+EXTRAS := dev,mlflow,wandb,tensorboard,view
 # Two cores learn as fast as one on small networks, but two test workers halve the waiting.
 WORKERS ?= 2
 

@@ -82,10 +82,13 @@ KEYS = (
     Key(
         "render",
         TEXT,
-        "none, or record a video of an evaluation episode",
-        choices=("none", "record"),
+        "display: live viewer; record: video and replay page; human: the task's own window",
+        choices=("none", "display", "record", "human"),
     ),
     Key("render_freq", WHOLE, "epochs between rendered ones", low=1),
+    Key("render_metrics_train", LIST, "metrics drawn beside training episodes"),
+    Key("render_metrics_test", LIST, "metrics drawn beside evaluation episodes"),
+    Key("render_frames_per_clip", WHOLE, "scenes per rendered clip; 0: one episode", low=0),
     Key("base_logdir", TEXT, "folder of all runs"),
     Key("restore_policy", TEXT, "folder of a saved policy to start from", optional=True),
     Key(

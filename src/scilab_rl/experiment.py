@@ -18,7 +18,13 @@ import hydra.utils
 from omegaconf import DictConfig, OmegaConf
 
 from scilab_rl import config, files, provenance
-from scilab_rl.errors import ConfigError, MissingDependencyError, ScilabRLError, did_you_mean
+from scilab_rl.errors import (
+    ConfigError,
+    MissingDependencyError,
+    RenderingError,
+    ScilabRLError,
+    did_you_mean,
+)
 from scilab_rl.metrics.criteria import final_score
 from scilab_rl.results import CONFIG_FILE, RunDirectory, RunResult
 from scilab_rl.seeding import resolve_seed, seed_everything
@@ -106,6 +112,7 @@ class Session:
     algorithm: Any
     trainer: Any
     trackers: TrackerGroup
+    showing: Any
 
     def learn(self, resumed_step: int | None = None) -> RunResult:
         """Train to the end, to an early stop, to an interruption or to a failure.
@@ -131,6 +138,7 @@ class Session:
         finally:
             result = self._result(time.monotonic() - started, **outcome)
             self.directory.write_result(result)
+            self.showing.close()
             self.trackers.end(result)
             self.train_env.close()
             self.eval_env.close()
@@ -141,6 +149,7 @@ class Session:
         from scilab_rl.training.trainer import FINISHED
 
         trainer = self.trainer
+        self.showing.begin()
         with polite_stop() as trainer.stop_request:
             try:
                 self.algorithm.learn(
@@ -185,8 +194,8 @@ def build(cfg: DictConfig, directory: RunDirectory) -> Session:
     trackers = open_trackers(cfg)
     trainer = Trainer(training_plan(cfg), eval_env, trackers, directory.path)
     trainer.watch(algorithm, observed_layer(train_env))
-    record_videos(cfg, trainer, directory)
-    return Session(cfg, directory, train_env, eval_env, algorithm, trainer, trackers)
+    showing = show_episodes(cfg, trainer, train_env, algorithm, directory)
+    return Session(cfg, directory, train_env, eval_env, algorithm, trainer, trackers, showing)
 
 
 def prepare_torch(cfg: DictConfig) -> None:
@@ -204,13 +213,36 @@ def make_environments(cfg: DictConfig) -> tuple[Any, Any]:
     from scilab_rl.envs.vectorize import make_eval_env, make_train_env
 
     settings = env_settings(cfg)
-    render_mode = None
-    if cfg.render == "record":
-        from scilab_rl.visualization.gl import choose_backend
+    train_settings = replace(settings, render_mode=render_mode(cfg.render))
+    if cfg.render == "human":  # one window is enough
+        return make_train_env(settings), make_eval_env(train_settings)
+    return make_train_env(train_settings), make_eval_env(train_settings)
 
+
+def render_mode(render: str) -> str | None:
+    """Return the mode in which environments draw, and prepare for drawing without a display.
+
+    Raises:
+        ConfigError: If a window is wanted and there is no display.
+    """
+    if render == "human":
+        from scilab_rl.visualization.live import has_display
+
+        if not has_display():
+            raise ConfigError(
+                "render=human opens a window, and there is no display here. render=display shows "
+                "the episodes in a browser, render=record keeps them as video."
+            )
+        return "human"
+    if render == "none":
+        return None
+    from scilab_rl.visualization.gl import choose_backend
+
+    # MuJoCo reads the choice when it is imported. Other simulators may draw without OpenGL, so that
+    # it is decided later whether a failure matters.
+    with contextlib.suppress(RenderingError):
         choose_backend()
-        render_mode = "rgb_array"
-    return make_train_env(settings), make_eval_env(replace(settings, render_mode=render_mode))
+    return "rgb_array"
 
 
 def env_settings(cfg: DictConfig) -> Any:
@@ -291,20 +323,23 @@ def training_plan(cfg: DictConfig) -> Any:
     )
 
 
-def record_videos(cfg: DictConfig, trainer: Any, directory: RunDirectory) -> None:
-    """Film one evaluation episode every ``render_freq`` epochs, with ``render=record``."""
-    if cfg.render != "record":
-        return
-    from scilab_rl.envs.vectorize import observed_layer
-    from scilab_rl.visualization.recorder import EpisodeRecorder
+def show_episodes(
+    cfg: DictConfig, trainer: Any, train_env: Any, algorithm: Any, directory: RunDirectory
+) -> Any:
+    """Prepare the live view or the recording of episodes, if one is wanted."""
+    from scilab_rl.training.showing import ShowingPlan, make_showing
 
-    recorder = EpisodeRecorder(observed_layer(trainer.eval_env), trainer.trackers.artifact)
-
-    def film(epoch: int) -> None:
-        if epoch % cfg.render_freq == 0 or epoch == 1:
-            recorder.arm(directory / "videos" / f"eval_epoch_{epoch:04d}.mp4")
-
-    trainer.before_evaluation.append(film)
+    plan = ShowingPlan(
+        render=cfg.render,
+        render_freq=cfg.render_freq,
+        render_frames_per_clip=cfg.render_frames_per_clip,
+        render_metrics_train=list(cfg.render_metrics_train),
+        render_metrics_test=list(cfg.render_metrics_test),
+        n_test_rollouts=cfg.n_test_rollouts,
+        env_id=cfg.env,
+        algorithm=cfg.algorithm.name,
+    )
+    return make_showing(plan, trainer, train_env, algorithm, directory.path)
 
 
 def run_info(

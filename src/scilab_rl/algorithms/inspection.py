@@ -10,6 +10,8 @@ answer with one row per entry. Otherwise the networks of Stable-Baselines3's pol
 from __future__ import annotations
 
 import contextlib
+import inspect
+import re
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -22,6 +24,7 @@ from scilab_rl.algorithms.compatibility import is_goal_space
 Q_VALUES, VALUE, LOG_PROB, ENTROPY = "q_values", "value", "log_prob", "entropy"
 INTRINSIC_REWARD, GOALS = "intrinsic_reward", "goals"
 N_ENTROPY_SAMPLES = 256
+_RECORD_CALL = re.compile(r"""\.record(?:_mean|_lazy)?\(\s*f?["']([^"'\n]+)["']""")
 
 Batch = Any  # observations of a vector environment: an array, or a dictionary of arrays
 
@@ -126,6 +129,21 @@ class Inspection:
         return batch if self._normalization is None else self._normalization.normalize_obs(batch)
 
 
+def recorded_names(algorithm: Any) -> set[str]:
+    """Return the names under which an algorithm records metrics, as its source code says.
+
+    Names that are put together while it runs come as patterns: ``train/rollout_obs_step_*``.
+    """
+    names: set[str] = set()
+    for ancestor in type(algorithm).__mro__:
+        try:
+            source = inspect.getsource(ancestor)
+        except (OSError, TypeError):  # built-in classes have no source
+            continue
+        names |= {re.sub(r"\{[^}]*\}", "*", name) for name in _RECORD_CALL.findall(source)}
+    return names
+
+
 def _methods(algorithm: Any) -> dict[str, Callable[..., Any]]:
     """Return how to ask for each quantity that the algorithm answers directly."""
     asked = _stable_baselines_methods(algorithm)
@@ -148,7 +166,7 @@ def _derived(algorithm: Any, asked: set[str]) -> set[str]:
 
 def _stable_baselines_methods(algorithm: Any) -> dict[str, Callable[..., Any]]:
     policy = getattr(algorithm, "policy", None)
-    if not callable(getattr(policy, "obs_to_tensor", None)):
+    if policy is None or not callable(getattr(policy, "obs_to_tensor", None)):
         return {}
     networks = _PolicyNetworks(policy)
     if hasattr(policy, "predict_values"):  # PPO, A2C, TRPO

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from scilab_rl.config import load_recorded
-from scilab_rl.errors import ConfigError, RenderingError
+from scilab_rl.errors import ConfigError
 from scilab_rl.results import CONFIG_FILE, RunDirectory, find_run
 from scilab_rl.workspace import open_desk
 
@@ -28,8 +28,9 @@ def main(arguments: list[str]) -> int:
     cfg = load_recorded(run / CONFIG_FILE)
     seed = options.seed or int(cfg.seed) + 1
     env, model = load_player(cfg, policy_folder(run, options), record=options.record)
-    video = film_first_episode(env, run) if options.record else None
+    finish = film_first_episode(model, env, cfg, run, options.metrics) if options.record else None
     evaluation = _play(model, env, options, seed)
+    video = finish() if finish is not None else None
     env.close()
     _report(evaluation, cfg, video)
     return 0
@@ -59,7 +60,9 @@ def load_player(cfg: Any, folder: Path, *, record: bool) -> tuple[Any, Any]:
     cfg = experiment.complete(cfg)
     experiment.prepare_torch(cfg)
     settings = experiment.env_settings(cfg)
-    env = make_eval_env(replace(settings, render_mode=_render_mode() if record else None))
+    env = make_eval_env(
+        replace(settings, render_mode=experiment.render_mode("record" if record else "none"))
+    )
     if "buffer_size" in cfg.algorithm:
         cfg.algorithm.buffer_size = min(cfg.algorithm.buffer_size, _SMALL_BUFFER)
     model = experiment.make_algorithm(cfg, env)
@@ -67,16 +70,26 @@ def load_player(cfg: Any, folder: Path, *, record: bool) -> tuple[Any, Any]:
     return env, model
 
 
-def film_first_episode(env: Any, run: RunDirectory) -> Path:
-    """Prepare the video of the next episode and return where it will be."""
-    from scilab_rl.envs.vectorize import observed_layer
-    from scilab_rl.visualization.recorder import EpisodeRecorder
+def film_first_episode(model: Any, env: Any, cfg: Any, run: RunDirectory, metrics: str) -> Any:
+    """Prepare the recording of the next episode; the result returns its video when called."""
+    from scilab_rl.training import showing
+    from scilab_rl.visualization.archive import FOLDER, SUFFIX
+    from scilab_rl.visualization.records import ClipInfo
 
-    folder = run / "videos"
-    folder.mkdir(exist_ok=True)
-    path = folder / f"play_{len(list(folder.glob('play_*.mp4'))) + 1:03d}.mp4"
-    EpisodeRecorder(observed_layer(env)).arm(path)
-    return path
+    if not showing.can_draw(env):
+        return lambda: None
+    folder = run / FOLDER
+    number = len(list(folder.glob(f"play_*{SUFFIX}"))) + 1
+    clip = ClipInfo(f"play_{number:03d}", "eval", 0, cfg.env, cfg.algorithm.name, 0.0, ())
+    names = metrics.split(",") if metrics else list(cfg.render_metrics_test)
+    timeline, recorder = showing.film_first_episode(env, model, names, clip, folder)
+
+    def finish() -> Path:
+        timeline.close()
+        recorder.close()
+        return folder / f"{clip.name}.mp4"
+
+    return finish
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
@@ -87,6 +100,9 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("run", help="'last', the path of a run or policy, or a part of its name")
     parser.add_argument("--episodes", type=_positive, default=10, help="how many (default 10)")
     parser.add_argument("--record", action="store_true", help="film the first episode")
+    parser.add_argument(
+        "--metrics", default="", help="drawn beside it: q_value,critic_variance,..."
+    )
     parser.add_argument("--policy", choices=("best", "finished"), default="best")
     parser.add_argument("--stochastic", action="store_true", help="sample actions")
     parser.add_argument("--seed", type=int, default=0, help="default: the run's seed plus 1")
@@ -99,18 +115,6 @@ def _positive(text: str) -> int:
     if number < 1:
         raise argparse.ArgumentTypeError(f"must be at least 1, but it is {number}")
     return number
-
-
-def _render_mode() -> str | None:
-    """Return ``rgb_array``, or None with a notice when no picture can be drawn."""
-    from scilab_rl.visualization.gl import choose_backend
-
-    try:
-        choose_backend()
-    except RenderingError as error:
-        _log.warning("%s Playing without pictures.", error)
-        return None
-    return "rgb_array"
 
 
 def _play(model: Any, env: Any, options: argparse.Namespace, seed: int) -> Any:

@@ -1,7 +1,7 @@
 """The logger that algorithms record to.
 
-It has the interface of Stable-Baselines3's ``Logger``, so that any of its algorithms takes it through
-``set_logger``, and none of its dependencies.
+It has the interface of Stable-Baselines3's ``Logger``, so that any of its algorithms takes it
+through ``set_logger``, and none of its dependencies.
 """
 
 from __future__ import annotations

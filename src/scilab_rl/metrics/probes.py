@@ -4,16 +4,18 @@ A probe is a function of the step, and takes as many of these as it needs, in th
 
     (algorithm, observation, action, reward, next_observation, info, done)
 
-It returns a number, several numbers by name, or None where there is nothing to say. Observations and
-actions are those of the environment, without a batch dimension; ``next_observation`` is the last
-one of the episode where ``done`` is true.
+It returns a number, several numbers by name, or None where there is nothing to say. Observations
+and actions are those of the environment, without a batch dimension; ``next_observation`` is the
+last one of the episode where ``done`` is true.
 
-Write your own in ``src/custom_probes.py`` and name it: ``render_metrics_train=[custom_probes.surprise]``.
-A class is made anew for each episode, so that it can remember what has been.
+Write your own in ``src/custom_probes.py`` and give its name to a run:
+``render_metrics_train=[custom_probes.surprise]``. A class is made anew for each episode, so that it
+can remember what has been.
 """
 
 from __future__ import annotations
 
+import fnmatch
 import importlib
 import inspect
 import math
@@ -227,7 +229,7 @@ _ALIASES = {f"{section}/rollout_rewards_step": "reward" for section in ("train",
 
 
 def built_in(name: str) -> Probe:
-    """Return a built-in probe, also by its name in the paper's time (``train/rollout_rewards_step``)."""
+    """Return a built-in probe; ``train/rollout_rewards_step`` is the reward's name in the paper."""
     function, needs = _PROBES[_ALIASES.get(name, name)]
     return Probe(name, _maker(function), _n_arguments(function), needs)
 
@@ -245,7 +247,7 @@ def resolve_metrics(
     Args:
         names: Probes, ``module.function`` of the user, and names that the algorithm records.
         mind: The algorithm.
-        recorded: Names that the algorithm is known to record; ``train/*`` allows any of a section.
+        recorded: Names that the algorithm is known to record, or patterns such as ``train/*``.
         key: The key of the list, for messages.
         who: The algorithm's name, for messages.
 
@@ -260,12 +262,12 @@ def resolve_metrics(
             probe = built_in(name)
             _check_answerable(probe, mind, key, who)
             probes.append(probe)
-        elif name in known or f"{name.partition('/')[0]}/*" in known:
+        elif any(fnmatch.fnmatchcase(name, pattern) for pattern in known):
             logged.append(name)
         elif "." in name and "/" not in name:
             probes.append(_custom(name, key))
         else:
-            words = [*_PROBES, *_ALIASES, *(word for word in known if not word.endswith("*"))]
+            words = [*_PROBES, *_ALIASES, *(word for word in known if "*" not in word)]
             raise ConfigError(
                 f"{key}: there is no metric '{name}'.{did_you_mean(name, words)} Probes of {who}: "
                 f"{', '.join(answerable(mind))}. It records: {listing(known) or 'nothing'}. "
@@ -337,14 +339,16 @@ def _numbered(values: Iterable[Any]) -> dict[str, float]:
 
 def _maker(function: Callable[..., Any]) -> Callable[[], Callable[..., Any]]:
     """Return how to get the function for an episode: a class is made anew for each."""
-    return function if inspect.isclass(function) else lambda: function
+    if inspect.isclass(function):
+        made: Callable[[], Any] = function
+        return made
+    return lambda: function
 
 
 def _n_arguments(function: Callable[..., Any]) -> int:
-    called = function.__call__ if inspect.isclass(function) else function
-    parameters = list(inspect.signature(called).parameters.values())
-    if inspect.isclass(function):
-        parameters = parameters[1:]
+    is_class = inspect.isclass(function)
+    called = vars(function)["__call__"] if is_class else function
+    parameters = list(inspect.signature(called).parameters.values())[is_class:]
     if any(parameter.kind is parameter.VAR_POSITIONAL for parameter in parameters):
         return len(ARGUMENTS)
     return len([p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)])
@@ -354,8 +358,8 @@ def _check_answerable(probe: Probe, mind: Inspectable, key: str, who: str) -> No
     missing = probe.needs - mind.quantities
     if missing:
         raise ConfigError(
-            f"{key}: {who} cannot answer '{probe.name}', because it has no {listing(missing)} here. "
-            f"It can answer: {', '.join(answerable(mind))}."
+            f"{key}: {who} cannot answer '{probe.name}', because it has no {listing(missing)} "
+            f"here. It can answer: {', '.join(answerable(mind))}."
         )
 
 
@@ -383,8 +387,10 @@ def _custom(name: str, key: str) -> Probe:
             f"({', '.join(ARGUMENTS)}), as many as it needs."
         )
 
-    def make() -> Callable[..., Any]:
-        function = own() if inspect.isclass(own) else own
+    make = _maker(own)
+
+    def make_for_algorithm() -> Callable[..., Any]:
+        function = make()
         return lambda mind, *rest: function(mind.algorithm, *rest)
 
-    return Probe(name, make, n_arguments)
+    return Probe(name, make_for_algorithm, n_arguments)

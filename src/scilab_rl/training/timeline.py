@@ -85,7 +85,7 @@ class Timeline:
             n_clips: How many; those of an earlier call that have not begun are dropped.
         """
         self._epoch = epoch
-        if self._n_scenes is not None:
+        if self._n_scenes is not None or not self.sinks:
             return
         self._clips_wanted = n_clips
         self.env.env_method("capture_frames", True, indices=[_ENV])
@@ -221,7 +221,7 @@ class Timeline:
 
     def _stop_without_frames(self, batch: StepBatch) -> None:
         self._warn_once(
-            f"There are no more pictures from {batch.phase} step {batch.step} on; the clip ends there."
+            f"There are no pictures from {batch.phase} step {batch.step} on; the clip ends there."
         )
         self._clips_wanted = 1
         self._end_clip()

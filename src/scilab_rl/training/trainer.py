@@ -75,6 +75,7 @@ class Trainer(BaseCallback):
         stopped_early: Whether the early-stop rule ended the run.
         stop_request: Becomes true when somebody asks to stop.
         before_evaluation: Called with the epoch's number before it is evaluated.
+        after_step: Called when the algorithm has recorded all that belongs to a step.
     """
 
     def __init__(
@@ -90,6 +91,7 @@ class Trainer(BaseCallback):
         self.stopped_early = False
         self.best: tuple[float, ...] | None = None
         self.before_evaluation: list[Callable[[int], Any]] = []
+        self.after_step: list[Callable[[], Any]] = []
         self.stop_request = StopRequest()
         self.statistics: RolloutStatistics | None = None
         self._epoch_started = 0.0
@@ -137,6 +139,8 @@ class Trainer(BaseCallback):
             self._boundary_taken = time.monotonic()
 
     def _on_step(self) -> bool:
+        for finish in self.after_step:
+            finish()
         self.trackers.step(self.num_timesteps)
         if self.stop_request and self._boundary is not None:
             self._stop(*self._boundary)

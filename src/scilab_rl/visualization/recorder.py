@@ -1,63 +1,75 @@
-"""Recording one episode of a vector environment as a video."""
+"""Keeping what is shown: one file per clip, and video, page and viewer recording made of it."""
 
 from __future__ import annotations
 
 import logging
+import queue
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
-from scilab_rl.envs.observed import ObservedVecEnv, StepBatch
-from scilab_rl.visualization.video import VideoWriter
+from scilab_rl.visualization.archive import SUFFIX, save_clip
+from scilab_rl.visualization.develop import develop
+from scilab_rl.visualization.records import Clip, ClipInfo, Record
 
 _log = logging.getLogger(__name__)
-DEFAULT_FPS = 25.0
 
 
-class EpisodeRecorder:
-    """Films the next episode of environment 0 whenever it is armed.
-
-    A frame that cannot be drawn or written ends the filming with one warning, never the run.
+class ClipRecorder:
+    """Collects records and writes each clip while training goes on.
 
     Args:
-        env: The environments; made with ``render_mode="rgb_array"``.
-        on_video: Called with the path of each finished video.
+        folder: Where the files go; made when the first clip is written.
+        on_file: Called with each finished video and page, from another thread.
     """
 
-    def __init__(
-        self, env: ObservedVecEnv, on_video: Callable[[Path], object] | None = None
-    ) -> None:
-        self.env = env
-        self.on_video = on_video
-        self.fps = float(env.get_attr("metadata")[0].get("render_fps") or DEFAULT_FPS)
-        self._writer: VideoWriter | None = None
-        env.observers.append(self)
+    def __init__(self, folder: Path, on_file: Callable[[Path], object] | None = None) -> None:
+        self.folder = folder
+        self.on_file = on_file
+        self.recordings: list[Path] = []
+        self._clip: Clip | None = None
+        self._finished: queue.SimpleQueue[Clip | None] = queue.SimpleQueue()
+        self._thread: threading.Thread | None = None
 
-    def arm(self, path: Path) -> None:
-        """Film the next episode into this file."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        self._writer = VideoWriter(path, self.fps)
-        self.env.env_method("capture_frames", True)
+    def begin(self, clip: ClipInfo) -> None:
+        """Begin a clip."""
+        self._clip = Clip(clip)
 
-    def on_step(self, batch: StepBatch) -> None:
-        """Add the frame of this step."""
-        if self._writer is None:
+    def add(self, record: Record) -> None:
+        """Keep a scene."""
+        assert self._clip is not None
+        self._clip.records.append(record)
+
+    def end(self) -> None:
+        """Hand the clip over to the writing thread."""
+        clip, self._clip = self._clip, None
+        if clip is None or not any(record.action is not None for record in clip.records):
             return
-        try:
-            if batch.episode_steps[0] == 0 and self.env.reset_frame is not None:
-                self._writer.add(self.env.reset_frame)
-            frame = batch.frames[0]
-            if frame is not None:
-                self._writer.add(frame)
-            if batch.dones[0]:
-                self._finish()
-        except (OSError, RuntimeError, ValueError) as error:
-            _log.warning("Recording stopped: %s. Training goes on.", error)
-            self._writer = None
+        if self._thread is None:
+            # No daemon: a program that ends waits for its last clip.
+            self._thread = threading.Thread(target=self._work, name="recorder")
+            self._thread.start()
+        self._finished.put(clip)
 
-    def _finish(self) -> None:
-        assert self._writer is not None
-        self._writer.close()
-        self.env.env_method("capture_frames", False)
-        path, self._writer = self._writer.path, None
-        if self.on_video is not None:
-            self.on_video(path)
+    def close(self) -> None:
+        """Wait until all clips are written."""
+        if self._thread is not None:
+            self._finished.put(None)
+            self._thread.join()
+            self._thread = None
+
+    def _work(self) -> None:
+        while (clip := self._finished.get()) is not None:
+            try:
+                self._write(clip)
+            except (OSError, RuntimeError) as error:
+                _log.warning("Recording %s: %s. Training goes on.", clip.info.name, error)
+
+    def _write(self, clip: Clip) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        path = self.folder / f"{clip.info.name}{SUFFIX}"
+        save_clip(clip, path)
+        self.recordings.append(path)
+        for finished in develop(path):
+            if self.on_file is not None:
+                self.on_file(finished)

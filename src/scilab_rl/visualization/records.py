@@ -1,10 +1,10 @@
-"""What is shown of an episode: one record per scene, with the frame and the numbers that belong to it.
+"""What is shown of an episode: one record per scene, with the numbers that belong to its frame.
 
 Record ``t`` holds the scene and the observation ``o_t`` in which the agent chose its action, that
 action ``a_t``, and the metrics of ``(o_t, a_t)``; reward, success and errors of that step are what
-the action led to. An episode of ``T`` steps has ``T + 1`` records: the last one holds the scene in which
-the episode ended, where nothing is done any more. So ``value`` and ``goal_distance`` reach to the end,
-and what needs an action has a gap there.
+the action led to. An episode of ``T`` steps has ``T + 1`` records: the last one holds the scene in
+which the episode ended, where nothing is done any more. So ``value`` and ``goal_distance`` reach to
+the end, and what needs an action has a gap there.
 """
 
 from __future__ import annotations
