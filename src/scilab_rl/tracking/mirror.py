@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import queue
 import threading
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
@@ -35,7 +36,7 @@ class Mirror(Tracker):
         *,
         queue_size: int = 10_000,
         max_failures: int = 3,
-        patience_seconds: float = 10.0,
+        patience_seconds: float = 20.0,
     ) -> None:
         self.tracker = tracker
         self.label = label
@@ -45,6 +46,7 @@ class Mirror(Tracker):
         self._thread = threading.Thread(target=self._work, name=f"{label} mirror", daemon=True)
         self._failures = 0
         self._off = False
+        self._closing: Callable[[], object] | None = None
 
     def begin(self, run: RunInfo) -> None:
         """Start the thread; the tracker itself is opened there."""
@@ -62,27 +64,30 @@ class Mirror(Tracker):
 
     def end(self, result: RunResult) -> None:
         """Queue the end and wait a while for everything to be written."""
-        self._put(lambda: self.tracker.end(result))
-        self._put(None)
-        self._thread.join(self.patience_seconds)
+        self._closing = lambda: self.tracker.end(result)
+        deadline = time.monotonic() + self.patience_seconds
+        for message in (self._closing, None):
+            self._put(message, max(0.0, deadline - time.monotonic()))
+        self._thread.join(max(0.0, deadline - time.monotonic()))
         if self._thread.is_alive():
             self._switch_off(f"it did not finish within {self.patience_seconds:g} s")
 
-    def _put(self, message: Callable[[], object] | None) -> None:
+    def _put(self, message: Callable[[], object] | None, patience_seconds: float = 0.0) -> None:
         try:
-            self._messages.put_nowait(message)
+            self._messages.put(message, timeout=patience_seconds)
         except queue.Full:
             self._switch_off("it is too slow")
 
     def _work(self) -> None:
         opened = False
         while (message := self._messages.get()) is not None:
-            if self._off:
+            # A tracker that has been opened is closed, even after it was switched off.
+            if self._off and not (opened and message is self._closing):
                 continue
             try:
                 message()
                 opened, self._failures = True, 0
-            except Exception as error:  # noqa: BLE001 - a mirror must survive whatever a tracker raises
+            except BaseException as error:  # noqa: BLE001 - some libraries even call sys.exit
                 self._failures += 1
                 if not opened or self._failures >= self.max_failures:
                     self._switch_off(str(error).strip().partition("\n")[0] or type(error).__name__)

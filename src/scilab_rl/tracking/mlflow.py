@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import os
+import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -16,6 +17,15 @@ from scilab_rl.tracking.base import RunInfo, Tracker
 _RUN_ID_FILE = "mlflow_run_id.txt"
 _MAX_PARAMETERS = 100  # of one log_batch
 _MAX_VALUE_CHARACTERS = 6000
+_REFUSED_IN_NAMES = re.compile(r"[^\w\-. :/]", re.ASCII)
+_SETTINGS = {
+    "MLFLOW_DISABLE_TELEMETRY": "true",
+    "DO_NOT_TRACK": "true",
+    "MLFLOW_LOGGING_LEVEL": "WARNING",
+    # MLflow's own patience with a server that is not there is minutes; many runs are shorter.
+    "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
+    "MLFLOW_HTTP_REQUEST_TIMEOUT": "4",
+}
 _STATUS = {"failed": "FAILED", "interrupted": "KILLED"}
 
 
@@ -33,21 +43,16 @@ class MLflowTracker(Tracker):
 
     def begin(self, run: RunInfo) -> None:
         """Create the run, or go on with it after a resume."""
-        os.environ.setdefault("MLFLOW_DISABLE_TELEMETRY", "true")
-        os.environ.setdefault("DO_NOT_TRACK", "true")
-        os.environ.setdefault("MLFLOW_LOGGING_LEVEL", "WARNING")
+        for name, value in _SETTINGS.items():
+            os.environ.setdefault(name, value)
         from mlflow.tracking import MlflowClient
 
-        uri = self.tracking_uri or f"sqlite:///{run.base_logdir.resolve() / 'mlflow.db'}"
-        with _locked(run.base_logdir / ".mlflow.lock"):
-            # The first client creates the tables, and two at once would collide.
-            self._client = MlflowClient(tracking_uri=uri)
-            experiment = self._experiment(run)
+        self._client = MlflowClient(tracking_uri=self.tracking_uri or _database(run.base_logdir))
         stored = run.run_dir / _RUN_ID_FILE
-        if stored.is_file():
-            self._run_id = stored.read_text(encoding="utf-8")
-            self._client.update_run(self._run_id, status="RUNNING")
+        if stored.is_file() and self._continues(stored.read_text(encoding="utf-8")):
             return
+        with _locked(run.base_logdir / ".mlflow.lock"):  # two runs must not both create it
+            experiment = self._experiment(run)
         tags = {"mlflow.note.content": run.notes} | dict.fromkeys(run.tags, "true")
         if run.group:
             tags["group"] = run.group
@@ -61,7 +66,7 @@ class MLflowTracker(Tracker):
         from mlflow.entities import Metric
 
         now = int(time.time() * 1000)
-        metrics = [Metric(name, value, now, step) for name, value in values.items()]
+        metrics = [Metric(_allowed(name), value, now, step) for name, value in values.items()]
         self._client.log_batch(self._run_id, metrics=metrics)
 
     def artifact(self, path: Path) -> None:
@@ -71,6 +76,17 @@ class MLflowTracker(Tracker):
     def end(self, result: RunResult) -> None:
         """Set the final status."""
         self._client.set_terminated(self._run_id, status=_STATUS.get(result.status, "FINISHED"))
+
+    def _continues(self, run_id: str) -> bool:
+        """Go on with a stored run; False when this database does not know it."""
+        from mlflow.exceptions import MlflowException
+
+        try:
+            self._client.update_run(run_id, status="RUNNING")
+        except MlflowException:
+            return False
+        self._run_id = run_id
+        return True
 
     def _experiment(self, run: RunInfo) -> str:
         name = run.project or "scilab-rl"
@@ -84,11 +100,34 @@ class MLflowTracker(Tracker):
         from mlflow.entities import Param
 
         parameters = [
-            Param(name, str(value)[:_MAX_VALUE_CHARACTERS])
+            Param(_allowed(name), str(value)[:_MAX_VALUE_CHARACTERS])
             for name, value in run.parameters.items()
         ]
         for start in range(0, len(parameters), _MAX_PARAMETERS):
             self._client.log_batch(self._run_id, params=parameters[start : start + _MAX_PARAMETERS])
+
+
+def _allowed(name: str) -> str:
+    """Return the name without the characters that would make MLflow refuse the whole batch."""
+    return _REFUSED_IN_NAMES.sub("_", name)
+
+
+def _database(base_logdir: Path) -> str:
+    """Return the address of the runs' database, which is created in one step.
+
+    MLflow needs seconds and many transactions for that. Two runs would collide, and a run that ends
+    meanwhile would leave a database that nobody can open.
+    """
+    from mlflow.tracking import MlflowClient
+
+    path = base_logdir.resolve() / "mlflow.db"
+    with _locked(base_logdir / ".mlflow.lock"):
+        if not path.exists():
+            unfinished = path.with_name(".mlflow.db.tmp")
+            unfinished.unlink(missing_ok=True)
+            MlflowClient(tracking_uri=f"sqlite:///{unfinished}").search_experiments()
+            unfinished.replace(path)
+    return f"sqlite:///{path}"
 
 
 @contextmanager

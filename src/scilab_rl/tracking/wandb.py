@@ -12,6 +12,7 @@ from typing import Any
 from scilab_rl.results import RunResult
 from scilab_rl.tracking.base import RunInfo, Tracker
 
+_PATIENCE_SECONDS = 10.0
 _log = logging.getLogger(__name__)
 
 
@@ -30,22 +31,20 @@ class WandbTracker(Tracker):
         """Open the run."""
         os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
         os.environ.setdefault("WANDB_SILENT", "true")
+        # Not in the home directory: a run leaves its traces among the runs and nowhere else.
+        for folder in ("WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
+            os.environ.setdefault(folder, str(run.base_logdir.resolve() / ".wandb"))
         import wandb
 
         mode = self.mode if self.mode != "auto" else ("online" if has_key() else "offline")
-        self._run = wandb.init(
-            project=run.project or "scilab-rl",
-            entity=run.entity,
-            group=run.group,
-            tags=list(run.tags) or None,
-            notes=run.notes or None,
-            name=run.name,
-            id=run.name,
-            resume="allow",
-            dir=str(run.run_dir),
-            config=dict(run.parameters),
-            mode=mode,  # type: ignore[arg-type]
-        )
+        try:
+            self._run = _open(run, mode)
+        except wandb.Error as error:
+            if mode == "offline":
+                raise
+            _log.warning("W&B cannot be reached (%s); the run is kept offline.", _first_line(error))
+            wandb.teardown()  # its service still holds the name of the run
+            self._run = _open(run, "offline")
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
         """Write the metrics of an epoch."""
@@ -65,6 +64,30 @@ class WandbTracker(Tracker):
         self._run.finish(exit_code=1 if result.status == "failed" else 0)
         if self._run.offline:
             _log.info("W&B is offline; sync with: wandb sync %s", Path(self._run.dir).parent)
+
+
+def _open(run: RunInfo, mode: str) -> Any:
+    import wandb
+
+    return wandb.init(
+        project=run.project or "scilab-rl",
+        entity=run.entity,
+        group=run.group,
+        tags=list(run.tags) or None,
+        notes=run.notes or None,
+        name=run.name,
+        id=run.name,
+        resume="allow",
+        dir=str(run.run_dir),
+        config=dict(run.parameters),
+        mode=mode,  # type: ignore[arg-type]
+        # The terminal belongs to the console tracker, its text to train.log.
+        settings=wandb.Settings(console="off", init_timeout=_PATIENCE_SECONDS),
+    )
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).strip().partition("\n")[0]
 
 
 def has_key() -> bool:
