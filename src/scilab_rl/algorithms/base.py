@@ -193,7 +193,7 @@ class OneFileAlgorithm(ABC):
             callback: Its ``on_step`` is called.
 
         Returns:
-            What happened, or None when the callback wants to stop.
+            What happened, or None when the callback wants to stop; the step is then forgotten.
         """
         new_obs: Any
         new_obs, rewards, dones, infos = self.env.step(actions)
@@ -208,6 +208,7 @@ class OneFileAlgorithm(ABC):
             }
         )
         if not callback.on_step():
+            self._break_off(new_obs)
             return None
         truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
         next_obs = with_terminal_observations(new_obs, dones, infos, lambda last: last)
@@ -367,17 +368,21 @@ class OneFileAlgorithm(ABC):
             self.num_timesteps = 0
         self._total_timesteps = self.num_timesteps + total_timesteps
         if reset_num_timesteps or self._last_obs is None:
-            self._last_obs = self.env.reset()
-            if self._vec_normalize_env is not None:
-                self._last_original_obs = self._vec_normalize_env.get_original_obs()
-            if isinstance(self.replay_buffer, HerReplayBuffer):
-                _end_running_episodes(self.replay_buffer)
+            self._break_off(self.env.reset())
         if isinstance(callback, list):
             callback = CallbackList(callback)
         if not isinstance(callback, BaseCallback):
             callback = ConvertCallback(callback)
         callback.init_callback(self)
         return callback
+
+    def _break_off(self, observations: Any) -> None:
+        """Go on from observations that do not follow from the last stored step."""
+        self._last_obs = observations
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+        if isinstance(self.replay_buffer, HerReplayBuffer):
+            _end_running_episodes(self.replay_buffer)
 
 
 class LazyNumber:
@@ -402,7 +407,7 @@ class LazyNumber:
 
 
 def _end_running_episodes(buffer: HerReplayBuffer) -> None:
-    """Close episodes that a reset has cut off, so that no goal is taken from the next one."""
+    """Close the recorded episodes, so that no goal is taken from what comes after a gap."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # what it warns about is what is wanted here
         buffer.truncate_last_trajectory()

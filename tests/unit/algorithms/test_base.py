@@ -175,6 +175,27 @@ def test_a_reset_closes_the_episodes_that_hindsight_replay_was_recording(make_en
     assert buffer.timeouts[3, 0] == 1.0  # cut off, not terminal
 
 
+@pytest.mark.parametrize("stop_after", [4, 15])
+def test_learning_goes_on_after_a_stop_where_the_environment_is(
+    make_env: Any, stop_after: int
+) -> None:
+    env = make_env("TinyReach-v0")  # 15 steps per episode
+    model = Probe(env=env, her=True)
+    model.learn(100, callback=Diary(stop_after))
+    model.learn(20, reset_num_timesteps=False)
+    buffer = model.replay_buffer
+    assert isinstance(buffer, HerReplayBuffer)
+    for before, after in itertools.pairwise(model.steps[stop_after - 1 :]):
+        if not before.dones[0]:
+            assert after.observations["observation"].tolist() == (
+                before.next_observations["observation"].tolist()
+            )
+    # The forgotten step divides the recorded episode, so that each part has goals of its own.
+    assert buffer.ep_length[: stop_after - 1, 0].tolist() == [stop_after - 1] * (stop_after - 1)
+    second = 15 if stop_after == 15 else 15 - stop_after
+    assert buffer.ep_length[stop_after - 1, 0] == second
+
+
 def test_actions_are_scaled_between_the_bounds() -> None:
     model = Probe(env=countdown(True))
     ours = np.float32([[-1.0, -1.0], [0.0, 0.0], [1.0, 0.5]])
