@@ -9,6 +9,7 @@ import sys
 import traceback
 import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 from scilab_rl import __version__
@@ -28,6 +29,8 @@ EXIT_INTERRUPTED, EXIT_PIPE_CLOSED = 130, 141
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
+    if sys.stdout is None:  # started with stdout closed
+        sys.stdout = Path(os.devnull).open("w")
     sys.exit(run_command_line(list(sys.argv[1:] if arguments is None else arguments)))
 
 

@@ -9,7 +9,7 @@ import logging
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -37,12 +37,17 @@ _log = logging.getLogger(__name__)
 _FALLBACK_CRITERION = "eval/mean_reward"
 
 
-def run(cfg: DictConfig, overrides: Sequence[str] = ()) -> RunResult:
+def run(
+    cfg: DictConfig,
+    overrides: Sequence[str] = (),
+    watch: Callable[[Session], object] | None = None,
+) -> RunResult:
     """Train an algorithm in an environment and leave a complete run behind.
 
     Args:
         cfg: The composed configuration.
         overrides: What the user typed, to be recorded.
+        watch: Called with the session before it learns, to follow it from outside.
 
     Returns:
         The result, as it is stored in the run's ``result.json``.
@@ -54,22 +59,29 @@ def run(cfg: DictConfig, overrides: Sequence[str] = ()) -> RunResult:
     cfg = complete(cfg)
     directory = RunDirectory.create(Path(cfg.base_logdir), cfg.env, cfg.algorithm.name, cfg.seed)
     try:
-        with _log_file(directory / "train.log"):
+        with directory.in_use(), _log_file(directory / "train.log"):
             session = build(cfg, directory)
-            files.write_text(directory / CONFIG_FILE, OmegaConf.to_yaml(cfg, resolve=True))
+            session.begin()
             provenance.write(directory, overrides, session.eval_env.envs[0])
+            if watch is not None:
+                watch(session)
             return session.learn()
     except ConfigError:
         directory.discard()
         raise
 
 
-def resume(cfg: DictConfig, directory: RunDirectory) -> RunResult:
+def resume(
+    cfg: DictConfig,
+    directory: RunDirectory,
+    watch: Callable[[Session], object] | None = None,
+) -> RunResult:
     """Continue an interrupted run as if nothing had happened.
 
     Args:
         cfg: The run's own configuration, perhaps with more epochs.
         directory: The run.
+        watch: Called with the session before it learns, to follow it from outside.
 
     Raises:
         CheckpointError: If the run has no whole checkpoint.
@@ -77,10 +89,12 @@ def resume(cfg: DictConfig, directory: RunDirectory) -> RunResult:
     from scilab_rl.training import resume as continuation
 
     cfg = complete(cfg)
+    cfg.restore_policy = None  # the checkpoint holds what became of it
     snapshot, step = continuation.load_latest(directory.path)
-    with _log_file(directory / "train.log"):
+    with directory.in_use(), _log_file(directory / "train.log"):
         session = build(cfg, directory)
         continuation.continue_from(snapshot, session.algorithm, session.trainer)
+        session.begin()
         return session.learn(resumed_step=step)
 
 
@@ -114,6 +128,13 @@ class Session:
     trackers: TrackerGroup
     showing: Any
 
+    def begin(self) -> None:
+        """Let the run be seen: its status, its final configuration, and the link to the newest."""
+        directory = self.directory
+        directory.write_result(RunResult("running", None, 0, 0, 0.0, str(directory)))
+        files.write_text(directory / CONFIG_FILE, OmegaConf.to_yaml(self.cfg, resolve=True))
+        directory.publish_as_last(Path(self.cfg.base_logdir))
+
     def learn(self, resumed_step: int | None = None) -> RunResult:
         """Train to the end, to an early stop, to an interruption or to a failure.
 
@@ -121,8 +142,6 @@ class Session:
             resumed_step: The step of the checkpoint that the run continues from.
         """
         started = time.monotonic()
-        self.directory.write_result(RunResult("running", None, 0, 0, 0.0, str(self.directory)))
-        self.directory.publish_as_last(Path(self.cfg.base_logdir))
         outcome: dict[str, Any] = {"status": "failed"}
         self.trackers.begin(run_info(self.cfg, self.directory, self.trainer, resumed_step))
         try:
@@ -362,6 +381,22 @@ def run_info(
         notes=cfg.info,
         resumed_step=resumed_step,
     )
+
+
+def criterion_of(values: Mapping[str, float], criterion: str) -> float:
+    """Return the criterion in one evaluation; tasks without success are judged by reward.
+
+    Raises:
+        ConfigError: If the evaluation does not have it.
+    """
+    if criterion not in values and criterion.startswith("eval/success"):
+        criterion = _FALLBACK_CRITERION
+    if criterion not in values:
+        raise ConfigError(
+            f"hyperopt_criterion: the run records no '{criterion}'."
+            f"{did_you_mean(criterion, values)}"
+        )
+    return float(values[criterion])
 
 
 def score(store: Any, cfg: DictConfig) -> float | None:

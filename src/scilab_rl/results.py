@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime as dt
+import fcntl
 import json
 import os
 import re
@@ -13,7 +14,7 @@ import shutil
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from scilab_rl import files
 from scilab_rl.errors import ConfigError, did_you_mean
@@ -21,6 +22,7 @@ from scilab_rl.errors import ConfigError, did_you_mean
 CONFIG_FILE = "config.yaml"
 RESULT_FILE = "result.json"
 LAST_LINK = "last"
+LOCK_FILE = ".lock"
 EXIT_REQUEUE = 75
 
 
@@ -127,9 +129,39 @@ class RunDirectory:
         except (OSError, ValueError, TypeError):
             return None
 
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Mark the run as alive for the block; the kernel takes the mark back when we die.
+
+        Raises:
+            ConfigError: If another process works on this run.
+        """
+        with (self / LOCK_FILE).open("w") as file:
+            if not _try_lock(file):
+                raise ConfigError(f"Another process works on '{self}'; wait for it or stop it.")
+            yield
+
+    def is_in_use(self) -> bool:
+        """Tell whether a process works on this run."""
+        try:
+            with (self / LOCK_FILE).open("r") as file:
+                return not _try_lock(file)
+        except OSError:
+            return False
+
     def publish_as_last(self, base: Path) -> None:
         """Let ``<base>/last`` point to this run."""
         files.point_to(base / LAST_LINK, self.path)
+
+
+def _try_lock(file: IO[str]) -> bool:
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError:  # a network drive without locks
+        return True
+    return True
 
 
 def slug(text: str) -> str:

@@ -114,6 +114,7 @@ def test_killed_and_resumed_equals_uninterrupted(algorithm: str, tmp_path: Path)
     killed = last_run(tmp_path)
     assert killed != uninterrupted
     assert json.loads((killed / "result.json").read_text())["status"] == "running"
+    assert "crashed" in scilab_rl("runs", "--last", "1", cwd=tmp_path).stdout
     resumed = scilab_rl("resume", "last", cwd=tmp_path)
     assert resumed.returncode == 0, resumed.stderr
     assert untimed_rows(killed) == untimed_rows(uninterrupted)

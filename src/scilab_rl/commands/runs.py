@@ -20,7 +20,8 @@ from scilab_rl.results import CONFIG_FILE, RESULT_FILE, RunDirectory, all_runs, 
 _log = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
-STATUSES = ("running", "finished", "stopped_early", "interrupted", "failed", DAMAGED)
+CRASHED = "crashed"  # says running, but its process is gone
+STATUSES = ("running", CRASHED, "finished", "stopped_early", "interrupted", "failed", DAMAGED)
 _COLUMNS = (
     "run", "env", "algorithm", "seed", "status", "success", "reward", "epochs", "steps", "time",
     "problem",
@@ -87,7 +88,7 @@ def read_run(run: RunDirectory) -> dict[str, Any]:
     else:
         values, epochs, steps, seconds = result.metrics, result.epochs, result.steps, result.seconds
         problem = problem or result.error
-        record["status"] = result.status if config else DAMAGED
+        record["status"] = _status(run, result.status) if config else DAMAGED
     if not isinstance(values, dict) or not values:
         values = _last_epoch(run)  # a run that is still going on
     return record | {
@@ -99,6 +100,10 @@ def read_run(run: RunDirectory) -> dict[str, Any]:
         "problem": problem,
         "path": str(run),
     }
+
+
+def _status(run: RunDirectory, recorded: str) -> str:
+    return CRASHED if recorded == "running" and not run.is_in_use() else recorded
 
 
 def as_clock(seconds: Any) -> str | None:

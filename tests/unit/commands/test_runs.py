@@ -72,8 +72,10 @@ def test_a_running_run_shows_its_last_epoch(make_run, listed):
         '{"kind": "ep',
     )
     (run / "metrics.jsonl").write_text("\n".join(lines), encoding="utf-8")
-    row = listed()[0]
+    with run.in_use():
+        row = listed()[0]
     assert (row["status"], row["epochs"], row["steps"], row["success"]) == ("running", 4, 800, 0.25)
+    assert listed()[0]["status"] == "crashed"
 
 
 @pytest.mark.parametrize(
