@@ -353,7 +353,8 @@ class OneFileAlgorithm(ABC):
             check_finite(name, stacked, self.n_updates, **shown)
             self.logger.record(f"train/{name}", stacked.mean())
         for name, value in vars(self).items():
-            if isinstance(value, nn.Module):
+            # Target networks follow the others, and are read in the losses.
+            if isinstance(value, nn.Module) and any(p.requires_grad for p in value.parameters()):
                 check_finite_weights(name, value, self.n_updates, **shown)
 
     def record_dimensions(self, name: str, vector: torch.Tensor | np.ndarray) -> None:

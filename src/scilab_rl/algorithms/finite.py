@@ -25,18 +25,9 @@ def check_finite(name: str, values: Any, update: int, **hyperparameters: Any) ->
     >>> check_finite("critic_loss", [0.1, 0.2], update=2, learning_rate=0.1)
     """
     array = torch.as_tensor(values).detach().flatten()
-    # NaN and infinity survive a sum, which is one fast pass over the weights of a network.
-    if torch.isfinite(array.sum()):
-        return
-    bad = torch.nonzero(~torch.isfinite(array)).flatten()
-    if not len(bad):  # the sum overflowed, the values did not
-        return
-    first = int(bad[0])
-    shown = ", ".join(f"{key}={value}" for key, value in hyperparameters.items())
-    raise NumericalError(
-        f"{name} is {array[first].item()} at update {update - len(array) + 1 + first} ({shown}). "
-        "Often the learning rate is too high."
-    )
+    bad = torch.nonzero(~torch.isfinite(array)).flatten().tolist()
+    if bad:
+        _refuse(name, array[bad[0]].item(), update - len(array) + 1 + bad[0], hyperparameters)
 
 
 def check_finite_weights(name: str, module: nn.Module, update: int, **shown: Any) -> None:
@@ -51,7 +42,20 @@ def check_finite_weights(name: str, module: nn.Module, update: int, **shown: Any
     Raises:
         NumericalError: With the parameter, the update and the hyperparameters.
     """
-    for parameter_name, parameter in module.named_parameters():
-        total = parameter.detach().sum()
-        if not torch.isfinite(total) and not torch.isfinite(parameter).all():
-            check_finite(f"{name}.{parameter_name}", total, update, **shown)
+    # NaN and infinity survive a sum: one fast pass tells for the whole network. Which weight it is,
+    # and whether only the sum overflowed, is asked afterwards.
+    with torch.no_grad():
+        total = torch.stack([parameter.sum() for parameter in module.parameters()]).sum()
+        if torch.isfinite(total):
+            return
+        for parameter_name, parameter in module.named_parameters():
+            bad = parameter[~torch.isfinite(parameter)]
+            if len(bad):
+                _refuse(f"{name}.{parameter_name}", bad[0].item(), update, shown)
+
+
+def _refuse(name: str, value: float, update: int, hyperparameters: dict[str, Any]) -> None:
+    shown = ", ".join(f"{key}={entry}" for key, entry in hyperparameters.items())
+    raise NumericalError(
+        f"{name} is {value} at update {update} ({shown}). Often the learning rate is too high."
+    )

@@ -293,7 +293,13 @@ def test_a_loss_that_is_no_number_is_named_with_its_update(bad: float, word: str
 
 
 def test_large_losses_are_still_numbers() -> None:
-    check_finite("loss", torch.full((3,), 3e38), update=3)  # their sum is not
+    check_finite("loss", torch.full((3,), 3e38), update=3)
+
+
+def test_large_weights_are_still_numbers() -> None:
+    network = torch.nn.Linear(3, 2)
+    torch.nn.init.constant_(network.weight, 3e38)  # the sum overflows
+    check_finite_weights("actor", network, update=1)
 
 
 def test_a_weight_that_is_no_number_is_named() -> None:
