@@ -32,7 +32,7 @@ import copy
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -46,6 +46,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm
+from scilab_rl.algorithms.intrinsic.build import make_intrinsic_reward
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
@@ -151,6 +152,8 @@ class SAC_VAR(OneFileAlgorithm):
         net_arch: Sizes of the hidden layers of actor and critics.
         replay_buffer_class: None: a plain replay buffer.
         replay_buffer_kwargs: Further arguments of the replay buffer.
+        intrinsic: A reward that the agent gives itself, mixed into the environment's; see
+            `scilab_rl.algorithms.intrinsic`. None: none.
         seed, device: See `OneFileAlgorithm`.
     """
 
@@ -179,6 +182,7 @@ class SAC_VAR(OneFileAlgorithm):
         net_arch: Sequence[int] = (256, 256),
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
+        intrinsic: str | Mapping[str, Any] | None = None,
         seed: int | None = None,
         device: str = "auto",
     ) -> None:
@@ -216,6 +220,7 @@ class SAC_VAR(OneFileAlgorithm):
         self.replay_buffer = self.make_replay_buffer(
             buffer_size, replay_buffer_class, replay_buffer_kwargs
         )
+        self.intrinsic = make_intrinsic_reward(intrinsic, self)
 
     def iterate(self, callback: BaseCallback) -> bool:
         """Collect ``train_freq`` steps of each environment, then update."""
@@ -259,6 +264,8 @@ class SAC_VAR(OneFileAlgorithm):
         losses: dict[str, list[Tensor]] = defaultdict(list)
         for _ in range(gradient_steps):
             batch = self.sample(self.batch_size)
+            if self.intrinsic is not None:
+                batch = self.intrinsic.add_to(batch)
             actions, log_prob = self.actor.sample(batch.observations)
 
             if self.learns_ent_coef:

@@ -13,6 +13,9 @@ from scilab_rl.errors import ConfigError, did_you_mean, listing
 FRAMEWORK_PARAMETERS = ("policy", "env", "seed", "device", "verbose", "tensorboard_log")
 _HIDDEN = ("self", "_init_setup_model", "env", "seed", "device", "verbose", "tensorboard_log")
 
+# Off-policy algorithms of Stable-Baselines3 take it too, see `intrinsic.build`.
+INTRINSIC = "intrinsic"
+
 _FRACTION = (0.0, 1.0)
 _POSITIVE = (math.ulp(0.0), math.inf)
 _AT_LEAST_1 = (1, math.inf)
@@ -42,7 +45,18 @@ RANGES: dict[str, tuple[float, float]] = {
 
 def allowed_arguments(cls: Callable[..., Any]) -> list[str]:
     """Return the keyword arguments that a user may set, in the constructor's order."""
-    return [name for name in _parameters(cls) if name not in _HIDDEN]
+    names = [name for name in _parameters(cls) if name not in _HIDDEN]
+    if takes_intrinsic_reward(cls) and INTRINSIC not in names:
+        names.append(INTRINSIC)
+    return names
+
+
+def takes_intrinsic_reward(cls: Callable[..., Any]) -> bool:
+    """Tell whether ``algorithm.intrinsic`` works: by a parameter, or through a replay buffer."""
+    from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+    is_off_policy = inspect.isclass(cls) and issubclass(cls, OffPolicyAlgorithm)
+    return is_off_policy or accepts(cls, INTRINSIC)
 
 
 def accepts(cls: Callable[..., Any], name: str) -> bool:
@@ -69,7 +83,8 @@ def check_arguments(name: str, cls: Callable[..., Any], arguments: Mapping[str, 
                 f"{did_you_mean(argument, allowed)} It has: {listing(allowed, limit=40)}."
             )
         _check_range(argument, value)
-        _check_type(argument, value, cls)
+        if accepts(cls, argument):
+            _check_type(argument, value, cls)
 
 
 def _parameters(cls: Callable[..., Any]) -> Iterable[str]:

@@ -7,12 +7,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
+from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.vec_env import VecEnv
 
-from scilab_rl.algorithms.arguments import accepts
+from scilab_rl.algorithms.arguments import INTRINSIC, accepts
 from scilab_rl.algorithms.compatibility import is_goal_space, is_image_space
+from scilab_rl.algorithms.intrinsic.build import reward_intrinsically, rewarding
 from scilab_rl.errors import ConfigError
 
 _log = logging.getLogger(__name__)
@@ -52,12 +55,18 @@ def build_algorithm(
         arguments["action_noise"] = _shaped_noise(noise, env)
     given = {"env": env, "seed": seed, "device": device}
     arguments |= {name: value for name, value in given.items() if accepts(cls, name)}
+    intrinsic = None if accepts(cls, INTRINSIC) else arguments.pop(INTRINSIC, None)
+    if intrinsic is not None:
+        arguments["replay_buffer_class"] = _rewarding_buffer(arguments, env)
     try:
-        return cls(**arguments)
+        algorithm = cls(**arguments)
     except (AssertionError, TypeError, ValueError) as error:
         raise ConfigError(
             f"{getattr(cls, '__name__', cls)} refuses its arguments: {error}"
         ) from error
+    if intrinsic is not None:
+        reward_intrinsically(algorithm, intrinsic)
+    return algorithm
 
 
 def policy_name(env: VecEnv) -> str:
@@ -83,6 +92,18 @@ def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:
             "observation, achieved_goal, desired_goal); add ++algorithm.replay_buffer_class=null."
         )
     arguments["learning_starts"] = _first_update(arguments, env)
+
+
+def _rewarding_buffer(arguments: dict[str, Any], env: VecEnv) -> type[ReplayBuffer]:
+    """Return the chosen kind of replay buffer, with the intrinsic reward in its samples."""
+    if arguments.get("n_steps", 1) > 1:
+        raise ConfigError(
+            "An intrinsic reward belongs to single steps; use it with algorithm.n_steps=1, not "
+            f"{arguments['n_steps']}."
+        )
+    is_dict = isinstance(env.observation_space, spaces.Dict)
+    plain = DictReplayBuffer if is_dict else ReplayBuffer
+    return rewarding(arguments.get("replay_buffer_class") or plain)
 
 
 def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:

@@ -26,7 +26,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,7 @@ from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
 from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm, Step
+from scilab_rl.algorithms.intrinsic.build import make_intrinsic_reward
 
 
 class ActorCritic(nn.Module):
@@ -110,6 +111,8 @@ class CLEANPPO(OneFileAlgorithm):
         max_grad_norm: Largest norm of a gradient.
         target_kl: Divergence from the old policy at which the epochs end; None: never.
         net_arch: Sizes of the hidden layers of policy and value function.
+        intrinsic: A reward that the agent gives itself, mixed into the environment's; see
+            `scilab_rl.algorithms.intrinsic`. None: none.
         seed, device: See `OneFileAlgorithm`.
     """
 
@@ -132,6 +135,7 @@ class CLEANPPO(OneFileAlgorithm):
         max_grad_norm: float = 0.5,
         target_kl: float | None = None,
         net_arch: Sequence[int] = (64, 64),
+        intrinsic: str | Mapping[str, Any] | None = None,
         seed: int | None = None,
         device: str = "auto",
     ) -> None:
@@ -154,6 +158,7 @@ class CLEANPPO(OneFileAlgorithm):
         self.optimizer = torch.optim.Adam(
             self.networks.parameters(), learning_rate, eps=1e-5, fused=True
         )
+        self.intrinsic = make_intrinsic_reward(intrinsic, self)
 
     def iterate(self, callback: BaseCallback) -> bool:
         """Collect a rollout, then learn from it."""
@@ -195,9 +200,18 @@ class CLEANPPO(OneFileAlgorithm):
         """
         observations = torch.stack([self.to_vector(step.observations) for step in steps])
         next_observations = torch.stack([self.to_vector(step.next_observations) for step in steps])
+        rewards = self._stacked(steps, "rewards")
+        if self.intrinsic is not None:
+            rewards = self.intrinsic.mix(
+                rewards.flatten(),
+                observations.flatten(0, 1),
+                actions.flatten(0, 1),
+                next_observations.flatten(0, 1),
+                batch_size=self.batch_size,
+            ).view_as(rewards)
         values = self.networks.value(observations)
         advantages = generalized_advantages(
-            self._stacked(steps, "rewards"),
+            rewards,
             values,
             self.networks.value(next_observations),
             self._stacked(steps, "terminated"),

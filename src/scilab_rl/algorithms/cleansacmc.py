@@ -50,6 +50,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 
 from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm
+from scilab_rl.algorithms.observations import state_columns
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 MODEL_LOG_STD_MIN, MODEL_LOG_STD_MAX = -5.0, 2.0
@@ -369,8 +370,13 @@ class CLEANSACMC(OneFileAlgorithm):
         return self.critic(self.to_vector(observations), actions)
 
     @torch.no_grad()
-    def intrinsic_reward(self, observations: Observation, env_actions: np.ndarray) -> Tensor:
-        """Return MC(s, a) of a batch of steps. Shapes: ``(batch,)``."""
+    def intrinsic_reward(
+        self,
+        observations: Observation,
+        env_actions: np.ndarray,
+        next_observations: Observation | None = None,
+    ) -> Tensor:
+        """Return MC(s, a) of a batch of steps, wherever they led. Shapes: ``(batch,)``."""
         actions = torch.as_tensor(self.from_env_actions(env_actions), device=self.device)
         return self.morphological_computation(self.to_vector(observations), actions).squeeze(1)
 
@@ -469,19 +475,6 @@ def gaussian_kl(mean_p: Tensor, log_std_p: Tensor, mean_q: Tensor, log_std_q: Te
     """
     spread = ((2 * log_std_p).exp() + (mean_p - mean_q).square()) / (2 * (2 * log_std_q).exp())
     return (log_std_q - log_std_p + spread - 0.5).sum(dim=1, keepdim=True)
-
-
-def state_columns(space: spaces.Space) -> list[int]:
-    """Return where in an observation's vector the body's state is: everywhere but at the goal."""
-    if not isinstance(space, spaces.Dict):
-        return list(range(spaces.flatdim(space)))
-    columns: list[int] = []
-    start = 0
-    for key, entry in space.spaces.items():
-        stop = start + spaces.flatdim(entry)
-        columns += [] if key == "desired_goal" else range(start, stop)
-        start = stop
-    return columns
 
 
 def complete_settings(mc: Mapping[str, Any] | None) -> dict[str, Any]:

@@ -95,6 +95,20 @@ class Inspection:
         )
         return float(_numbers(answer).item())
 
+    def intrinsic_rewards(
+        self, observations: Batch, actions: np.ndarray, next_observations: Batch
+    ) -> np.ndarray:
+        """Return the rewards that the algorithm gives itself for a step of each environment.
+
+        Shapes:
+            all entries: ``(n_envs, ...)``; result: ``(n_envs,)``.
+        """
+        with self.undisturbed():
+            answer = self._ask[INTRINSIC_REWARD](
+                self._normalized(observations), actions, self._normalized(next_observations)
+            )
+        return _numbers(answer).reshape(-1)
+
     def learned_reward(self, reward: float) -> float:
         """Return a reward in the scale that the critics learn, which VecNormalize may change."""
         if self._normalization is None:
@@ -126,6 +140,9 @@ class Inspection:
             batch: Batch = {key: np.asarray(value)[None] for key, value in observation.items()}
         else:
             batch = np.asarray(observation)[None]
+        return self._normalized(batch)
+
+    def _normalized(self, batch: Batch) -> Batch:
         return batch if self._normalization is None else self._normalization.normalize_obs(batch)
 
 
@@ -134,14 +151,15 @@ def recorded_names(algorithm: Any) -> set[str]:
 
     Names that are put together while it runs come as patterns: ``train/rollout_obs_step_*``.
     """
-    names: set[str] = set()
-    for ancestor in type(algorithm).__mro__:
+    names = {"train/intrinsic_reward_step"} if INTRINSIC_REWARD in _methods(algorithm) else set()
+    intrinsic = type(getattr(algorithm, "intrinsic", None))
+    for ancestor in (*type(algorithm).__mro__, *intrinsic.__mro__):
         try:
             source = inspect.getsource(ancestor)
         except (OSError, TypeError):  # built-in classes have no source
             continue
         names |= {re.sub(r"\{[^}]*\}", "*", name) for name in _RECORD_CALL.findall(source)}
-    return names
+    return {name for name in names if not name.startswith("*")}
 
 
 def _methods(algorithm: Any) -> dict[str, Callable[..., Any]]:
@@ -150,6 +168,8 @@ def _methods(algorithm: Any) -> dict[str, Callable[..., Any]]:
     for quantity in (Q_VALUES, VALUE, LOG_PROB, ENTROPY, INTRINSIC_REWARD):
         if callable(own := getattr(algorithm, quantity, None)):
             asked[quantity] = own
+    if (intrinsic := getattr(algorithm, "intrinsic", None)) is not None:
+        asked.setdefault(INTRINSIC_REWARD, intrinsic.of_steps)
     return asked
 
 

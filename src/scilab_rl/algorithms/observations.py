@@ -37,6 +37,19 @@ def to_vector(values: Any, space: spaces.Space, device: torch.device) -> torch.T
     return vector / 255.0 if space.dtype == np.uint8 else vector
 
 
+def state_columns(space: spaces.Space) -> list[int]:
+    """Return where in an observation's vector the state is: everywhere but at the desired goal."""
+    if not isinstance(space, spaces.Dict):
+        return list(range(spaces.flatdim(space)))
+    columns: list[int] = []
+    start = 0
+    for key, entry in space.spaces.items():
+        stop = start + spaces.flatdim(entry)
+        columns += [] if key == "desired_goal" else range(start, stop)
+        start = stop
+    return columns
+
+
 def batch_of_one(observation: Observation) -> Observation:
     """Give a single observation a batch dimension."""
     if isinstance(observation, dict):

@@ -44,8 +44,9 @@ _CANDIDATES = tuple(
     f"scilab_rl.testing:{name}"
     for name in ("TinyReach-v0", "TinyReachDiscrete-v0", "TinyBox-v0", "TinyDiscrete-v0")
 )
-# Stable-Baselines3's plumbing, which its YAML files leave at its defaults.
+# Plumbing of Stable-Baselines3 and ours, which a YAML file may leave at its defaults.
 _PLUMBING = {
+    "intrinsic",
     "optimize_memory_usage",
     "rollout_buffer_class",
     "rollout_buffer_kwargs",

@@ -18,6 +18,7 @@ import torch
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize, sync_envs_normalization
 
+from scilab_rl.algorithms.inspection import INTRINSIC_REWARD, Inspection
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.errors import NumericalError
 from scilab_rl.metrics.criteria import is_better, should_stop_early
@@ -103,8 +104,12 @@ class Trainer(BaseCallback):
     def watch(self, model: Any, train_env: ObservedVecEnv) -> None:
         """Attach to an algorithm and the environments it learns in."""
         model.set_logger(self.metric_logger)
+        mind = Inspection(model)
         self.statistics = RolloutStatistics(
-            self.metric_logger, train_env.num_envs, self.trackers.episode
+            self.metric_logger,
+            train_env.num_envs,
+            self.trackers.episode,
+            curious=mind if INTRINSIC_REWARD in mind.quantities else None,
         )
         train_env.observers.append(self.statistics)
 
