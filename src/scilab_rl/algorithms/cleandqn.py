@@ -123,9 +123,8 @@ class CLEANDQN(OneFileAlgorithm):
         """Act and store what happens; return False when the callback wants to stop."""
         callback.on_rollout_start()
         for _ in range(self.train_freq):
-            observations, actions = self._last_obs, self.explore()
-            q = LazyNumber(lambda o=observations, a=actions: self.q_values(o, a)[0])  # type: ignore[misc]
-            self.logger.record("train/rollout_q_step", q)
+            actions = self.explore()
+            self._record_step(self._last_obs, actions)
             step = self.step(actions, callback)
             if step is None:
                 return False
@@ -140,7 +139,8 @@ class CLEANDQN(OneFileAlgorithm):
         if self.num_timesteps < self.learning_starts:
             return self.sample_env_actions()
         with torch.no_grad():
-            return self.to_env_actions(self.act(self.to_vector(self._last_obs), False))
+            actions = self.act(self.to_vector(self._last_obs), deterministic=False)
+        return self.to_env_actions(actions)
 
     def act(self, observations: Tensor, deterministic: bool) -> Tensor:
         """Choose the best actions, each replaced by a random one with probability epsilon."""
@@ -181,6 +181,10 @@ class CLEANDQN(OneFileAlgorithm):
             records["q_mean"].append(q.detach().mean())
         self.record_losses(records)
         self.logger.record("train/exploration_rate", self.exploration_rate)
+
+    def _record_step(self, observations: Observation, env_actions: np.ndarray) -> None:
+        q = LazyNumber(lambda: self.q_values(observations, env_actions)[0])
+        self.logger.record("train/rollout_q_step", q)
 
     @torch.no_grad()
     def q_values(self, observations: Observation, env_actions: np.ndarray) -> Tensor:
