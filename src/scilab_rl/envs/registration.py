@@ -11,6 +11,7 @@ from collections.abc import Iterable
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
+from scilab_rl.envs.ids import register_shipped, register_variant
 from scilab_rl.errors import ConfigError, MissingDependencyError, did_you_mean
 
 # Suites that register their ids only when they are imported: package -> (extra, start of its ids).
@@ -32,7 +33,8 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
     """Return the id to make, and a one-line notice when it differs from the given one.
 
     A name without version means the newest version. A version that is gone or can no longer be
-    made (``FetchPush-v1``) becomes the newest one.
+    made (``FetchPush-v1``) becomes the newest one. A long id (``Blocks-o2-gripper_above-v1``) names
+    a variant, which is registered here.
 
     Args:
         given: For example ``FetchPush-v4``, ``FetchPush-v1``, ``FetchPush`` or ``module:Id-v0``.
@@ -46,6 +48,9 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
     module, _, name = given.rpartition(":")
     if module:
         _import_user_module(module, given)
+    variant = None if module else register_variant(name)
+    if variant is not None:
+        return variant
     _register_suite_of(name)
     parsed = _VERSIONED.match(name)
     assert parsed is not None  # the pattern fits every text
@@ -153,3 +158,6 @@ def versions_by_family(ids: Iterable[str]) -> dict[str, list[str]]:
     for env_id in sorted(ids, key=lambda i: (_family_of(i), _version_of(i))):
         families.setdefault(_family_of(env_id), []).append(env_id)
     return families
+
+
+register_shipped()

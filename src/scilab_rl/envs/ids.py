@@ -1,0 +1,115 @@
+"""The environments that Scilab-RL brings itself, and the long ids that name their variants.
+
+A variant such as ``Blocks-o2-gripper_above-v1`` is not one of thousands of registered ids: its name
+is read, and this one variant is registered when somebody asks for it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+
+from scilab_rl.errors import ConfigError
+
+_VERSION = r"(?:-v\d+)?"
+
+
+@dataclass(frozen=True)
+class Family:
+    """One environment with its variants.
+
+    Attributes:
+        env_id: The registered id.
+        entry_point: ``module:Class``.
+        max_episode_steps: Step limit of the registered id.
+        grammar: What the names of its variants look like, for people.
+        pattern: The same as a regular expression; its groups are keyword arguments.
+        read: Turns the groups into keyword arguments and, under ``max_episode_steps``, the limit.
+    """
+
+    env_id: str
+    entry_point: str
+    max_episode_steps: int
+    grammar: str = ""
+    pattern: str = "(?!)"
+    read: Callable[[Mapping[str, str]], dict[str, Any]] = field(default=lambda groups: {})
+
+    @property
+    def name(self) -> str:
+        """The id without its version."""
+        return self.env_id.rpartition("-v")[0]
+
+    @property
+    def version(self) -> str:
+        """The version, as in ``v1``."""
+        return self.env_id.rpartition("-")[2]
+
+
+def _read_blocks(groups: Mapping[str, str]) -> dict[str, Any]:
+    n_blocks = int(groups["n_blocks"])
+    return {
+        "n_blocks": n_blocks,
+        "gripper_goal": groups["gripper_goal"],
+        "max_episode_steps": 50 * max(1, n_blocks),
+    }
+
+
+FAMILIES = (
+    Family("Reach1DOF-v0", "scilab_rl.envs.reach_1dof:Reach1DOF", 50),
+    Family(
+        "Blocks-v1",
+        "scilab_rl.envs.blocks:Blocks",
+        50,
+        "Blocks-o{0..4}-gripper_{none,random,above}-v1, with o0 only gripper_random",
+        r"Blocks-(?:o(?P<n_blocks>[0-4])-gripper_(?P<gripper_goal>none|random|above))(?<!o0-gripper_none)(?<!o0-gripper_above)",
+        _read_blocks,
+    ),
+)
+
+
+def register_shipped() -> None:
+    """Make the ids known; nothing is imported before one of them is made."""
+    for family in FAMILIES:
+        if family.env_id not in gym.registry:
+            gym.register(
+                family.env_id,
+                entry_point=family.entry_point,
+                max_episode_steps=family.max_episode_steps,
+            )
+
+
+def register_variant(name: str) -> tuple[str, str] | None:
+    """Register the variant that a long id names.
+
+    Args:
+        name: For example ``Blocks-o0-gripper_random-v1``; another version or none means ours.
+
+    Returns:
+        The id and a notice of one line about its meaning, or None when it names no variant.
+
+    Raises:
+        ConfigError: If it begins like a variant and is none.
+    """
+    for family in FAMILIES:
+        if not family.grammar or not name.startswith(f"{family.name}-"):
+            continue
+        if re.fullmatch(rf"{family.name}-v\d+", name):
+            return None
+        match = re.fullmatch(family.pattern + _VERSION, name)
+        if match is None:
+            raise ConfigError(f"No environment '{name}'. Its variants are {family.grammar}.")
+        env_id = f"{re.sub(_VERSION + '$', '', name)}-{family.version}"
+        return env_id, _register(family, env_id, family.read(match.groupdict()))
+    return None
+
+
+def _register(family: Family, env_id: str, arguments: dict[str, Any]) -> str:
+    limit = arguments.pop("max_episode_steps", family.max_episode_steps)
+    if env_id not in gym.registry:
+        gym.register(env_id, family.entry_point, max_episode_steps=limit, kwargs=arguments)
+    meaning = ", ".join(f"{key}={value}" for key, value in arguments.items())
+    return f"{env_id} is {family.env_id} with {meaning}, {limit} steps."
