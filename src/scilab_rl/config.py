@@ -19,6 +19,7 @@ from typing import Any
 import hydra
 import hydra.utils
 import yaml
+from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf, open_dict
 from omegaconf.errors import OmegaConfBaseException
 
@@ -137,6 +138,7 @@ _KNOWN_METRICS = (
     "eval/rollout_rewards_step",
     "rollout/success_rate",
     "rollout/ep_rew_mean",
+    "rollout/intrinsic_ep_rew_mean",
     "rollout/ep_len_mean",
 )
 
@@ -313,6 +315,8 @@ def explain_error(error: Exception) -> ConfigError:
     if unknown:
         return _unknown_override(unknown[1])
     first_line = next((line for line in str(error).splitlines() if line.strip()), repr(error))
+    if isinstance(error, OverrideParseException):
+        return ConfigError(f"'{error.override}' cannot be read: {first_line.strip()}.")
     key = getattr(error, "full_key", None) if isinstance(error, OmegaConfBaseException) else None
     return ConfigError(f"{first_line.strip()}{f' (key {key})' if key else ''}")
 
