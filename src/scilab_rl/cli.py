@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 from scilab_rl import __version__
-from scilab_rl.errors import ConfigError, ScilabRLError, did_you_mean
+from scilab_rl.errors import ConfigError, ScilabRLError, SomeRunsFailedError, did_you_mean
 
 COMMANDS = {
     "play": "watch or film a trained policy and measure its success",
+    "view": "look at recorded episodes",
+    "probe": "compute metrics for recorded episodes, also with other checkpoints",
     "resume": "continue an interrupted run",
     "runs": "list the recorded runs",
     "algorithms": "list the algorithms",
@@ -37,7 +39,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run_command_line(arguments: list[str]) -> int:
     """Run one command and return its exit code.
 
-    0: done. 1: the run failed. 2: wrong input, nothing started. 130: interrupted.
+    0: done. 1: the run failed. 2: wrong input, nothing started. 3: some of several runs failed.
+    130: interrupted.
     """
     debug = "--debug" in arguments
     arguments = [argument for argument in arguments if argument != "--debug"]
@@ -121,16 +124,31 @@ def train(arguments: list[str]) -> int:
         return results[-1].score
 
     open_desk()
+    # Hydra takes overrides before its flags only.
+    arguments = sorted(arguments, key=lambda argument: argument in ("--multirun", "-m"))
     original, sys.argv = sys.argv, [sys.argv[0], *map(friendly_override, arguments)]
     try:
         task()
+    except ScilabRLError:
+        raise
     except Exception as error:
         raise explain_error(error) from error
     finally:
         sys.argv = original
     if errors:
-        raise errors[0] if isinstance(errors[0], ScilabRLError) else explain_error(errors[0])
+        raise _summary_of(errors, n_runs=len(errors) + len(results))
     return results[-1].exit_code if results else 0
+
+
+def _summary_of(errors: Sequence[Exception], n_runs: int) -> ScilabRLError:
+    """Return what to tell about the runs that failed."""
+    from scilab_rl.config import explain_error
+
+    ours = [e if isinstance(e, ScilabRLError) else explain_error(e) for e in errors]
+    nothing_started = len(ours) == n_runs and all(isinstance(e, ConfigError) for e in ours)
+    if n_runs == 1 or nothing_started:
+        return ours[0]
+    return SomeRunsFailedError(f"{len(ours)} of {n_runs} runs failed, first with: {ours[0]}")
 
 
 def _set_up_messages(debug: bool) -> None:

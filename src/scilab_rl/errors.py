@@ -10,7 +10,8 @@ class ScilabRLError(Exception):
     """Something the user can understand and repair; shown as one line.
 
     Attributes:
-        exit_code: What the command line returns: 1 for a run that failed, 2 for wrong input.
+        exit_code: What the command line returns: 1 for a run that failed, 2 for wrong input, 3 for
+            several runs of which some failed.
     """
 
     exit_code = 1
@@ -48,6 +49,12 @@ class NumericalError(AlgorithmError):
 
 class EnvironmentError_(ScilabRLError):
     """An environment failed or broke its contract."""
+
+
+class SomeRunsFailedError(ScilabRLError):
+    """A multirun or a study has ended, and some of its runs failed."""
+
+    exit_code = 3
 
 
 class CheckpointError(ScilabRLError):

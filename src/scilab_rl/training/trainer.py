@@ -76,6 +76,7 @@ class Trainer(BaseCallback):
         stopped_early: Whether the early-stop rule ended the run.
         stop_request: Becomes true when somebody asks to stop.
         before_evaluation: Called with the epoch's number before it is evaluated.
+        may_go_on: Called after each epoch with step, epoch and metrics; one False ends the run.
         after_step: Called when the algorithm has recorded all that belongs to a step.
     """
 
@@ -92,6 +93,7 @@ class Trainer(BaseCallback):
         self.stopped_early = False
         self.best: tuple[float, ...] | None = None
         self.before_evaluation: list[Callable[[int], Any]] = []
+        self.may_go_on: list[Callable[[int, int, Mapping[str, float]], bool]] = []
         self.after_step: list[Callable[[], Any]] = []
         self.stop_request = StopRequest()
         self.statistics: RolloutStatistics | None = None
@@ -170,6 +172,8 @@ class Trainer(BaseCallback):
             plan.early_stop_threshold,
             plan.early_stop_last_n,
         )
+        for ask in self.may_go_on:
+            self.stopped_early |= not ask(self.num_timesteps, self.n_epochs_done, values)
         self._epoch_started = time.monotonic()
         self._epoch_first_step = self.num_timesteps
 

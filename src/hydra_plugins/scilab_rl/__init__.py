@@ -1,0 +1,1 @@
+"""Adapters through which Hydra discovers our sweeper and launchers."""

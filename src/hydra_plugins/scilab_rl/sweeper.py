@@ -1,0 +1,33 @@
+"""Lets Hydra find our sweeper: studies go to `scilab_rl.hyperopt`, plain grids to Hydra's own."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+
+class StudySweeper(BasicSweeper):
+    """Runs a multirun as a study when it searches, and as a grid when it lists.
+
+    Args:
+        settings: The mapping ``hydra.sweeper``.
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__(max_batch_size=None, params=settings.get("params"))
+
+    def sweep(self, arguments: list[str]) -> Any:
+        """Run all trials."""
+        from scilab_rl.hyperopt import sweep
+
+        assert self.config is not None and self.hydra_context is not None
+        sweeper = OmegaConf.to_container(self.config.hydra.sweeper, resolve=True)
+        assert isinstance(sweeper, dict)
+        parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
+        overrides = parser.parse_overrides([*self._parse_config(), *arguments])
+        if sweep.is_study(sweeper, overrides):
+            return sweep.run_study(sweeper, overrides)
+        return super().sweep(arguments)

@@ -1,0 +1,178 @@
+"""Worker processes that are started once, take a run whenever they are free, and are replaced."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from pathlib import Path
+from types import TracebackType
+
+from scilab_rl.hyperopt import worker
+from scilab_rl.hyperopt.worker import Message, Task
+
+
+@dataclass
+class Worker:
+    """One process of the pool.
+
+    Attributes:
+        process: The process.
+        connection: Our end of its pipe.
+        job: Number of the run that it trains, or None when it is free.
+        busy_since: Monotonic time, in seconds, at which that run was given to it.
+    """
+
+    process: BaseProcess
+    connection: Connection
+    job: int | None = None
+    busy_since: float = 0.0
+
+
+class Pool:
+    """A number of workers on this machine.
+
+    Args:
+        size: Most workers at the same time.
+        log_dir: Folder for what they print.
+    """
+
+    def __init__(self, size: int, log_dir: Path) -> None:
+        self.size = size
+        self.log_dir = log_dir
+        self.n_threads = max(1, n_cores() // size)
+        self.busy_seconds = 0.0
+        self._workers: list[Worker] = []
+        self._context = multiprocessing.get_context("spawn")
+
+    def __enter__(self) -> Pool:
+        self.log_dir.mkdir(parents=True, exist_ok=True)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
+    ) -> None:
+        for one in self._workers:
+            if one.job is None:
+                one.connection.close()  # it is waiting for work and now ends by itself
+            else:
+                one.process.kill()
+        for one in self._workers:
+            one.process.join(5)
+            if one.process.is_alive():
+                one.process.kill()
+
+    @property
+    def n_busy(self) -> int:
+        """Workers that train a run."""
+        return sum(one.job is not None for one in self._workers)
+
+    @property
+    def jobs(self) -> list[int]:
+        """The runs that are being trained."""
+        return [one.job for one in self._workers if one.job is not None]
+
+    def has_room(self) -> bool:
+        """Tell whether another run can begin at once."""
+        return self.n_busy < self.size
+
+    def submit(self, job: int, task: Task) -> None:
+        """Give a run to a free worker, started now if need be.
+
+        Args:
+            job: Number of the run.
+            task: What to train.
+        """
+        free = next((one for one in self._workers if one.job is None), None) or self._start()
+        free.job, free.busy_since = job, time.monotonic()
+        try:
+            free.connection.send(task)
+        except OSError:  # it died while it was idle; its end comes as a message
+            free.process.kill()
+
+    def answer(self, job: int, go_on: bool) -> None:
+        """Answer an evaluation."""
+        for one in self._workers:
+            if one.job == job:
+                try:
+                    one.connection.send(go_on)
+                except OSError:
+                    return  # it has died meanwhile; its end comes as a message
+
+    def messages(self, timeout: float) -> list[tuple[int, Message]]:
+        """Wait for news and return them, each with the number of its run.
+
+        Args:
+            timeout: Seconds to wait at most.
+        """
+        by_connection = {one.connection: one for one in self._workers}
+        news = []
+        for ready in wait(list(by_connection), timeout):
+            one = by_connection[ready]  # type: ignore[index]
+            job = one.job
+            try:
+                message = one.connection.recv()
+            except (EOFError, OSError):
+                message = Message("died", {"error": self._bury(one)})
+            if message.kind in ("finished", "failed", "died"):
+                self._release(one)
+            if job is not None and message.kind != "ready":
+                news.append((job, message))
+        return news
+
+    def kill_older_than(self, seconds: float) -> list[int]:
+        """Kill the workers that have trained one run for longer, and return their runs."""
+        late = [
+            one
+            for one in self._workers
+            if one.job is not None and time.monotonic() - one.busy_since > seconds
+        ]
+        jobs = [one.job for one in late if one.job is not None]
+        for one in late:
+            one.process.kill()
+            self._bury(one)
+            self._release(one)
+        return jobs
+
+    def kill_all(self) -> None:
+        """Kill all workers at once."""
+        for one in list(self._workers):
+            one.process.kill()
+            self._bury(one)
+
+    def _start(self) -> Worker:
+        ours, theirs = self._context.Pipe()
+        log = self.log_dir / f"worker-{os.getpid()}-{len(self._workers)}.log"
+        # No daemon: a run may have environment processes of its own.
+        process = self._context.Process(target=worker.main, args=(theirs, str(log), self.n_threads))
+        process.start()
+        theirs.close()
+        self._workers.append(Worker(process, ours))
+        return self._workers[-1]
+
+    def _release(self, one: Worker) -> None:
+        if one.job is not None:
+            self.busy_seconds += time.monotonic() - one.busy_since
+        one.job = None
+
+    def _bury(self, one: Worker) -> str:
+        """Remove a dead worker and return how it died."""
+        one.process.join(5)
+        code = one.process.exitcode
+        one.connection.close()
+        self._workers.remove(one)
+        if code is not None and code < 0:
+            hint = ", maybe out of memory" if -code == signal.SIGKILL else ""
+            return f"the worker was killed by {signal.Signals(-code).name}{hint}"
+        return f"the worker ended with exit code {code}"
+
+
+def n_cores() -> int:
+    """Return how many cores this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1

@@ -1,0 +1,80 @@
+"""The files that a study leaves: tables, plots, one page, and the winner as tuned values."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scilab_rl.files import write_text
+from scilab_rl.hyperopt.ledger import Ledger
+from scilab_rl.hyperopt.summary import Summary, summarize
+from scilab_rl.tracking.console import print_table
+
+REPORT, WINNER_FILE, TABLE = "report.html", "winner.yaml", "settings.csv"
+
+
+@dataclass(frozen=True)
+class Report:
+    """A study's summary and where its files are.
+
+    Attributes:
+        summary: What the study has found.
+        directory: The folder of the study.
+    """
+
+    summary: Summary
+    directory: Path
+
+    def print_summary(self) -> None:
+        """Print the result on standard output."""
+        facts = [*self.summary.facts(), ("report", str(self.directory / REPORT))]
+        print_table(facts)
+
+
+def write_report(ledger: Ledger) -> Report:
+    """Write the report of a study, finished or not."""
+    from scilab_rl.hyperopt import page, plots
+
+    summary = summarize(ledger)
+    directory = ledger.directory
+    write_text(directory / TABLE, summary.table())
+    if summary.winner is not None:
+        write_text(directory / WINNER_FILE, tuned_values(summary))
+    figures = plots.draw_all(summary, directory / "plots")
+    write_text(directory / REPORT, page.render(summary, figures))
+    return Report(summary, directory)
+
+
+def tuned_values(summary: Summary) -> str:
+    """Return the winner as a file of the group ``tuned_values``."""
+    assert summary.winner is not None
+    values: dict[str, Any] = {}
+    for name, value in typed_setting(summary).items():
+        _put(values, name.split("."), value)
+    facts = "".join(f"# {name}: {text}\n" for name, text in summary.facts()[-4:-1])
+    return (
+        f"# @package _global_\n# Found by the study {summary.name}.\n{facts}"
+        f"{yaml.safe_dump(values, sort_keys=False)}"
+    )
+
+
+def typed_setting(summary: Summary) -> Mapping[str, Any]:
+    """Return the winner's values, with lists as lists."""
+    assert summary.winner is not None
+    setting = {}
+    for name, value in summary.winner.setting.items():
+        if isinstance(value, str) and re.match(r"[\[{]", value):
+            value = yaml.safe_load(value)
+        setting[name] = value
+    return setting
+
+
+def _put(tree: dict[str, Any], path: list[str], value: Any) -> None:
+    for part in path[:-1]:
+        tree = tree.setdefault(part, {})
+    tree[path[-1]] = value
