@@ -90,6 +90,12 @@ KEYS = (
     Key("render_metrics_train", LIST, "metrics drawn beside training episodes"),
     Key("render_metrics_test", LIST, "metrics drawn beside evaluation episodes"),
     Key("render_frames_per_clip", WHOLE, "scenes per rendered clip; 0: one episode", low=0),
+    Key(
+        "record_when",
+        TEXT,
+        "with render=record: keep only moments, such as 'critic_variance > p99' or 'object fell'",
+        optional=True,
+    ),
     Key("base_logdir", TEXT, "folder of all runs"),
     Key("restore_policy", TEXT, "folder of a saved policy to start from", optional=True),
     Key(

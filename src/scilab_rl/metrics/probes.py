@@ -262,10 +262,10 @@ def resolve_metrics(
             probe = built_in(name)
             _check_answerable(probe, mind, key, who)
             probes.append(probe)
-        elif any(fnmatch.fnmatchcase(name, pattern) for pattern in known):
-            logged.append(name)
         elif "." in name and "/" not in name:
             probes.append(_custom(name, key))
+        elif any(fnmatch.fnmatchcase(name, pattern) for pattern in known):
+            logged.append(name)
         else:
             words = [*_PROBES, *_ALIASES, *(word for word in known if "*" not in word)]
             raise ConfigError(

@@ -16,6 +16,7 @@ from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.vectorize import observed_layer
 from scilab_rl.errors import RenderingError
 from scilab_rl.metrics.probes import ShownMetrics, resolve_metrics
+from scilab_rl.metrics.triggers import Trigger, parse_trigger
 from scilab_rl.training.timeline import RecordSink, Timeline
 from scilab_rl.training.trainer import Trainer
 from scilab_rl.visualization.archive import FOLDER
@@ -35,6 +36,7 @@ class ShowingPlan:
         render: ``record``, ``display``, or anything else: nothing is shown.
         render_freq: Epochs between shown ones; the first one is always shown.
         render_frames_per_clip: Scenes of a clip; 0: one episode.
+        record_when: Condition of the moments that are kept, instead of whole clips.
         render_metrics_train: Metrics beside training episodes.
         render_metrics_test: Metrics beside evaluation episodes.
         n_test_rollouts: Evaluation episodes per epoch.
@@ -45,6 +47,7 @@ class ShowingPlan:
     render: str
     render_freq: int
     render_frames_per_clip: int
+    record_when: str | None
     render_metrics_train: Sequence[str]
     render_metrics_test: Sequence[str]
     n_test_rollouts: int
@@ -147,20 +150,22 @@ def make_showing(
     if not plan.needs_frames:
         return Showing(trainer)
     mind, who = Inspection(algorithm), plan.algorithm
+    trigger = parse_trigger(plan.record_when) if plan.record_when else None
+    watched = [trigger.metric] if trigger is not None and trigger.metric else []
     train_metrics = resolve_metrics(
-        plan.render_metrics_train,
+        [*plan.render_metrics_train, *watched],
         mind,
         recorded_names(algorithm),
         key="render_metrics_train",
         who=who,
     )
     test_metrics = resolve_metrics(
-        plan.render_metrics_test, mind, (), key="render_metrics_test", who=who
+        [*plan.render_metrics_test, *watched], mind, (), key="render_metrics_test", who=who
     )
     if not can_draw(trainer.eval_env):
         return Showing(trainer)
     panels = tuple(dict.fromkeys(train_metrics.names + test_metrics.names))
-    sinks = [_make_sink(plan, panels, folder, trainer.trackers.artifact)]
+    sinks = [_make_sink(plan, panels, trigger, folder, trainer.trackers.artifact)]
 
     def timeline(env: ObservedVecEnv, metrics: ShownMetrics, logger: Any = None) -> Timeline:
         return Timeline(
@@ -178,7 +183,7 @@ def make_showing(
         plan.render_freq,
         train=timeline(observed_layer(train_env), train_metrics, trainer.metric_logger),
         evaluation=timeline(observed_layer(trainer.eval_env), test_metrics),
-        n_eval_clips=plan.n_test_rollouts if plan.render == DISPLAY else 1,
+        n_eval_clips=plan.n_test_rollouts if plan.render == DISPLAY or trigger else 1,
         sinks=sinks,
     )
 
@@ -230,7 +235,11 @@ def frames_per_second(env: ObservedVecEnv) -> float:
 
 
 def _make_sink(
-    plan: ShowingPlan, panels: tuple[str, ...], folder: Path, on_file: Callable[[Path], object]
+    plan: ShowingPlan,
+    panels: tuple[str, ...],
+    trigger: Trigger | None,
+    folder: Path,
+    on_file: Callable[[Path], object],
 ) -> RecordSink:
     if plan.render == DISPLAY:
         from scilab_rl.visualization.live import LiveViewer
@@ -242,4 +251,9 @@ def _make_sink(
         if path.suffix in _FOR_TRACKERS:
             on_file(path)
 
-    return ClipRecorder(folder / FOLDER, give_to_trackers)
+    recorder = ClipRecorder(folder / FOLDER, give_to_trackers)
+    if trigger is None:
+        return recorder
+    from scilab_rl.visualization.gallery import MomentRecorder
+
+    return MomentRecorder(recorder, trigger, give_to_trackers)

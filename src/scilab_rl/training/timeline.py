@@ -10,6 +10,7 @@ import numpy as np
 
 from scilab_rl.algorithms.inspection import Inspection
 from scilab_rl.envs.observed import ObservedVecEnv, StepBatch
+from scilab_rl.errors import did_you_mean
 from scilab_rl.metrics.events import EpisodeEvents
 from scilab_rl.metrics.logger import MetricLogger
 from scilab_rl.metrics.probes import EpisodeProbes, ShownMetrics
@@ -96,7 +97,7 @@ class Timeline:
         """Make the record of this step, if it is shown."""
         if not self._clips_wanted:
             return
-        self.complete_step()
+        self._send_pending()  # of an algorithm that does not say when a step is complete
         if batch.episode_steps[_ENV] == 0:
             self._begin_episode(batch)
         if self._n_scenes is None:
@@ -111,16 +112,9 @@ class Timeline:
         if not self._clips_wanted:
             return
         seen = self.logger.take_seen() if self.logger is not None else {}
-        if not self._pending:
-            return
-        records, self._pending = self._pending, []
-        records[0].values |= seen
-        for record in records:
-            self._send(record)
-        if self._n_scenes is None:
-            return
-        if self._clip_is_full(records[-1]):
-            self._end_clip()
+        if self._pending:
+            self._pending[0].values |= seen
+            self._send_pending()
 
     def close(self) -> None:
         """Finish the clip that is running, if any."""
@@ -197,6 +191,13 @@ class Timeline:
             events=self._events.of_scene(observation, self._last_success),
         )
 
+    def _send_pending(self) -> None:
+        records, self._pending = self._pending, []
+        for record in records:
+            self._send(record)
+        if records and self._n_scenes is not None and self._clip_is_full(records[-1]):
+            self._end_clip()
+
     def _clip_is_full(self, last: Record) -> bool:
         if self.frames_per_clip:
             return (self._n_scenes or 0) >= self.frames_per_clip
@@ -214,10 +215,17 @@ class Timeline:
         self._n_scenes = None
         self._clips_wanted -= 1
         self._tell("end")
+        self._warn_of_mistyped_names()
         if not self._clips_wanted:
             self.env.env_method("capture_frames", False, indices=[_ENV])
             if self.logger is not None:
                 self.logger.watch(())
+
+    def _warn_of_mistyped_names(self) -> None:
+        known = self.logger.name_to_value if self.logger is not None else {}
+        for name in self.metrics.recorded:
+            if name not in known and (suggestion := did_you_mean(name, known)):
+                self._warn_once(f"'{name}' has not been recorded: its panel is empty.{suggestion}")
 
     def _stop_without_frames(self, batch: StepBatch) -> None:
         self._warn_once(

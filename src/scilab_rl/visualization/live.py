@@ -105,13 +105,7 @@ class LiveViewer:
         self.address = page_address(uri, host, page_port)
         _log.info("Live view: %s", self.address)
         if host == LOOPBACK:
-            _log.info(
-                "From another machine: ssh -L %d:%s:%d -L %d:%s:%d %s@%s",
-                *(page_port, LOOPBACK, page_port),
-                *(self.data_port, LOOPBACK, self.data_port),
-                getpass.getuser(),
-                socket.gethostname(),
-            )
+            _log.info("%s", ssh_line(page_port, self.data_port))
         return child
 
 
@@ -130,6 +124,12 @@ def serve_page(source: str, host: str, page_port: int) -> subprocess.Popen[bytes
 def page_address(uri: str, host: str, page_port: int) -> str:
     """Return the address to open in a browser."""
     return f"http://{host}:{page_port}/?url={urllib.parse.quote(uri, safe='')}"
+
+
+def ssh_line(*ports: int) -> str:
+    """Return the command that makes ports of this machine those of another one."""
+    forwards = " ".join(f"-L {port}:{LOOPBACK}:{port}" for port in ports)
+    return f"From another machine first: ssh {forwards} {getpass.getuser()}@{socket.gethostname()}"
 
 
 def start_viewer(arguments: list[str]) -> subprocess.Popen[bytes]:

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 _JPEG_QUALITY = 88
+_FLAT = 5e-3  # smaller relative changes are drawn as none: four digits could not tell them apart
 _SMALL_SIDE = 200  # pixels; small frames cost little without loss
 
 
@@ -165,7 +166,9 @@ def value_range(curves: Sequence[Sequence[float | None]]) -> tuple[float, float]
     if not numbers:
         return 0.0, 1.0
     low, high = min(numbers), max(numbers)
-    room = 0.06 * (high - low) if high > low else max(abs(high) * 0.1, 0.5)
+    room = 0.06 * (high - low)
+    if high - low < _FLAT * max(abs(low), abs(high)) or high == low:
+        room = max(0.1 * abs(high), 1e-9) if high else 0.5
     return low - room, high + room
 
 
