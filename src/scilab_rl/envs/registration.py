@@ -24,7 +24,7 @@ SUITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "highway_env": ("highway", ("parking", "highway", "merge", "roundabout", "intersection")),
     "myosuite": ("myosuite", ("myo",)),
 }
-_VERSIONED = re.compile(r"^(?P<name>.+?)(?:-v(?P<version>\d+))?$")
+_VERSIONED = re.compile(r"(?P<name>.*?)(?:-v(?P<version>\d+))?", re.DOTALL)
 # Entry points of ids that stay registered and can no longer be made.
 _ABANDONED = re.compile(r"MujocoPy|mujoco_py|_raise_shimmy_error")
 
@@ -52,7 +52,7 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
     if variant is not None:
         return variant
     _register_suite_of(name)
-    parsed = _VERSIONED.match(name)
+    parsed = _VERSIONED.fullmatch(name)
     assert parsed is not None  # the pattern fits every text
     family, version = parsed["name"], parsed["version"]
     usable = _usable_versions(family)

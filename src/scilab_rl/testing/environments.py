@@ -124,13 +124,13 @@ class TinyReach(gym.Env):
 
 
 class TinyReachDiscrete(TinyReach):
-    """TinyReach with four actions: right, left, up, down."""
+    """TinyReach with five actions: right, left, up, down, stay."""
 
-    _MOVEMENTS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]], np.float32)
+    _MOVEMENTS = np.array([[1, 0], [-1, 0], [0, 1], [0, -1], [0, 0]], np.float32)
 
     def __init__(self) -> None:
         super().__init__()
-        self.action_space = spaces.Discrete(4)
+        self.action_space = spaces.Discrete(len(self._MOVEMENTS))
 
     def _movement(self, action: Any) -> np.ndarray:
         return self._MOVEMENTS[int(action)]

@@ -1,0 +1,112 @@
+import numpy as np
+import pytest
+from gymnasium.wrappers import FlattenObservation, TransformReward
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+
+from scilab_rl.envs.vectorize import (
+    EnvSettings,
+    make_eval_env,
+    make_single_env,
+    make_train_env,
+    observed_layer,
+)
+from scilab_rl.errors import ConfigError, EnvironmentError_
+
+REACH = "scilab_rl.testing:TinyReach-v0"
+BOX = "scilab_rl.testing:TinyBox-v0"
+
+
+def course(env, n=40):
+    seen = [dict(env.reset())]
+    for i in range(n):
+        actions = np.full((env.num_envs, 2), np.sin(i), np.float32)
+        observations, rewards, dones, _ = env.step(actions)
+        seen.append((dict(observations), rewards.tolist(), dones))
+    env.close()
+    return repr(seen)
+
+
+def test_a_seed_fixes_the_whole_course_and_environments_differ():
+    one, two, other = (
+        course(make_train_env(EnvSettings(REACH, n_envs=2, seed=s))) for s in (1, 1, 2)
+    )
+    assert one == two != other
+    goals = make_train_env(EnvSettings(REACH, n_envs=3)).reset()["desired_goal"]
+    assert len({tuple(goal) for goal in goals.tolist()}) == 3
+
+
+def test_evaluation_has_its_own_stream_and_one_environment():
+    settings = EnvSettings(REACH, n_envs=3, seed=1, vector="subprocess")
+    evaluation = make_eval_env(settings)
+    assert evaluation.num_envs == 1
+    training = make_train_env(EnvSettings(REACH, seed=1))
+    assert evaluation.reset()["desired_goal"].tolist() != training.reset()["desired_goal"].tolist()
+
+
+def test_subprocesses_do_the_same_as_one_process():
+    """Also shows that workers can import environments that are named by their module."""
+    inside = make_train_env(EnvSettings(REACH, n_envs=2, seed=1))
+    outside = make_train_env(EnvSettings(REACH, n_envs=2, seed=1, vector="subprocess"))
+    assert isinstance(observed_layer(inside).venv, DummyVecEnv)
+    assert isinstance(observed_layer(outside).venv, SubprocVecEnv)
+    assert course(inside, 20) == course(outside, 20)
+
+
+def test_wrappers_apply_in_order_to_environments_and_to_the_vector():
+    wrappers = [
+        FlattenObservation,
+        lambda env: TransformReward(env, lambda reward: 10 * reward),
+        lambda env: TransformReward(env, lambda reward: reward + 1),
+        VecNormalize,
+    ]
+    env = make_train_env(EnvSettings(REACH, wrappers=wrappers))
+    assert env.observation_space.shape == (6,)
+    assert isinstance(env, VecNormalize)
+    seen = []
+    observed_layer(env).observers.append(
+        type("Seen", (), {"on_step": lambda _, b: seen.append(b)})()
+    )
+    env.reset()
+    for _ in range(15):
+        env.step(np.zeros((1, 2), np.float32))
+    # 10 * -1 + 1 or 10 * 0 + 1, and not normalised where observers look
+    assert {float(batch.rewards[0]) for batch in seen} <= {-9.0, 1.0}
+
+
+def test_evaluation_measures_true_rewards_and_does_not_adapt():
+    env = make_eval_env(EnvSettings(BOX, wrappers=[VecNormalize]))
+    assert (env.training, env.norm_reward, env.norm_obs) == (False, False, True)
+    env = make_train_env(EnvSettings(BOX, wrappers=[VecNormalize]))
+    assert (env.training, env.norm_reward) == (True, True)
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"reward_typ": "dense"}, r"takes no env_kwargs.reward_typ. Did you mean 'reward_type'"),
+        ({"zzz": 1}, r"takes no env_kwargs.zzz. It takes: .*reward_type"),
+    ],
+)
+def test_an_unknown_keyword_is_named_with_those_that_exist(kwargs, message):
+    with pytest.raises(ConfigError, match=message):
+        make_single_env(EnvSettings("FetchReach-v4", env_kwargs=kwargs))
+
+
+def test_keywords_reach_the_environment():
+    env = make_single_env(EnvSettings("Pendulum-v1", env_kwargs={"g": 3.0}))
+    assert env.unwrapped.g == 3.0
+
+
+def test_an_environment_that_cannot_be_made_is_one_line(monkeypatch):
+    def explode(self):
+        raise OSError("no simulator here")
+
+    monkeypatch.setattr("scilab_rl.testing.environments.TinyBox.__init__", explode)
+    with pytest.raises(EnvironmentError_, match="cannot be made: OSError: no simulator here"):
+        make_train_env(EnvSettings(BOX))
+
+
+def test_environments_are_only_drawn_when_somebody_looks():
+    assert make_single_env(EnvSettings("Pendulum-v1")).render_mode is None
+    env = make_single_env(EnvSettings("Pendulum-v1", render_mode="rgb_array"))
+    assert env.render_mode == "rgb_array"
