@@ -14,8 +14,8 @@ TABLE_HEIGHT = 0.4
 STEP_LENGTH = 0.05
 FINGER_JOINTS = ("robot0:l_gripper_finger_joint", "robot0:r_gripper_finger_joint")
 _START_JOINTS = {"robot0:slide0": 0.405, "robot0:slide1": 0.48, "robot0:slide2": 0.0}
-# Where Fetch's gripper link is held at the start; the place between the fingers is 2 cm below.
-_START_LINK = (1.3419, 0.7491, 0.555)
+# Where the gripper is held at the start, as in Fetch; its link is 2 cm above the finger tips.
+_START_PLACE, _LINK_HEIGHT = (1.3419, 0.7491), 0.02
 _POINTING_DOWN = (np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0)
 _SETTLING_STEPS = 10
 
@@ -32,12 +32,15 @@ class FetchTask(MujocoGoalEnv):
         kwargs: Those of `MujocoGoalEnv`.
 
     Attributes:
+        fingers_closed: Whether the fingers stay closed, whatever the action.
+        start_height: The height of the place between the finger tips at the start, in m.
         gripper: Site between the finger tips.
         start: Where it is at the start of an episode. Shapes: ``(3,)`` in m.
     """
 
     action_size = 4
     fingers_closed: bool = False
+    start_height: float = 0.535
     camera = {"distance": 1.35, "azimuth": 140.0, "elevation": -25.0, "lookat": (1.25, 0.75, 0.52)}  # noqa: RUF012
 
     def __init__(
@@ -66,7 +69,7 @@ class FetchTask(MujocoGoalEnv):
         model.geom_rgba[model.geom_bodyid == model.body("robot0:mocap").id, 3] = 0.0
         # The weld holds the link exactly at the mocap body: no offset, no turn.
         model.eq_data[0, :10] = (0, 0, 0, 0, 0, 0, 1, 0, 0, 0)
-        data.mocap_pos[self._hand] = _START_LINK
+        data.mocap_pos[self._hand] = *_START_PLACE, self.start_height + _LINK_HEIGHT
         data.mocap_quat[self._hand] = _POINTING_DOWN
         mujoco.mj_step(model, data, nstep=_SETTLING_STEPS * self.n_substeps)
         data.time = 0.0

@@ -58,6 +58,39 @@ def _read_blocks(groups: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
+def _read_hook(groups: Mapping[str, str]) -> dict[str, Any]:
+    n_blocks = int(groups["n_blocks"])
+    return {"n_blocks": n_blocks, "max_episode_steps": 50 if n_blocks == 0 else 100 * n_blocks}
+
+
+def _read_buttons(groups: Mapping[str, str]) -> dict[str, Any]:
+    n_buttons = int(groups["n_buttons"])
+    return {"n_buttons": n_buttons, "max_episode_steps": 50 * (n_buttons + 1)}
+
+
+def _read_maze(groups: Mapping[str, str]) -> dict[str, Any]:
+    whole = {name: int(groups[name]) for name in ("frame_skip", "n_objects") if name in groups}
+    return {
+        "maze_map": groups["maze_map"],
+        "reward_type": groups["reward_type"],
+        "threshold": float(groups["threshold"]),
+        "continuing": groups["continuing"] == "1",
+        "reset_target": groups["reset_target"] == "1",
+        **whole,
+        "max_episode_steps": int(groups["max_episode_steps"]),
+    }
+
+
+_MAPS = ("open", "open_dg", "open_dgr", "small_open_dg", "small_open_dgr", "medium_custom_dgr")
+_REWARD = r"-(?P<reward_type>sparse|sparseneg|dense)"
+_PLACE = (
+    r"-(?P<threshold>\d+(?:\.\d+)?)"
+    rf"-(?P<maze_map>{'|'.join(_MAPS)})"
+    r"-c(?P<continuing>[01])-rt(?P<reset_target>[01])-s(?P<max_episode_steps>[1-9]\d*)"
+)
+_PLACE_GRAMMAR = f"THRESHOLD-MAP-c{{0,1}}-rt{{0,1}}-sSTEPS-v0, MAP one of {', '.join(_MAPS)}"
+_REWARD_GRAMMAR = "{sparse,sparseneg,dense}"
+
 FAMILIES = (
     Family("Reach1DOF-v0", "scilab_rl.envs.reach_1dof:Reach1DOF", 50),
     Family(
@@ -65,8 +98,49 @@ FAMILIES = (
         "scilab_rl.envs.blocks:Blocks",
         50,
         "Blocks-o{0..4}-gripper_{none,random,above}-v1, with o0 only gripper_random",
-        r"Blocks-(?:o(?P<n_blocks>[0-4])-gripper_(?P<gripper_goal>none|random|above))(?<!o0-gripper_none)(?<!o0-gripper_above)",
+        r"Blocks-(?!o0-gripper_(?:none|above))"
+        r"o(?P<n_blocks>[0-4])-gripper_(?P<gripper_goal>none|random|above)",
         _read_blocks,
+    ),
+    Family(
+        "Hook-v1",
+        "scilab_rl.envs.hook:Hook",
+        100,
+        "Hook-o{0..2}-v1",
+        r"Hook-o(?P<n_blocks>[0-2])",
+        _read_hook,
+    ),
+    Family(
+        "ButtonUnlock-v1",
+        "scilab_rl.envs.button_unlock:ButtonUnlock",
+        100,
+        "ButtonUnlock-o{0..2}-v1",
+        r"ButtonUnlock-o(?P<n_buttons>[0-2])",
+        _read_buttons,
+    ),
+    Family(
+        "PointGym-v0",
+        "scilab_rl.envs.mazes:PointMaze",
+        500,
+        f"PointGym-{_REWARD_GRAMMAR}-{_PLACE_GRAMMAR}",
+        f"PointGym{_REWARD}{_PLACE}",
+        _read_maze,
+    ),
+    Family(
+        "PointObjGym-v0",
+        "scilab_rl.envs.mazes:PointObjMaze",
+        300,
+        f"PointObjGym-{_REWARD_GRAMMAR}-o{{0..8}}-{_PLACE_GRAMMAR}",
+        rf"PointObjGym{_REWARD}-o(?P<n_objects>[0-8]){_PLACE}",
+        _read_maze,
+    ),
+    Family(
+        "AntGym-v0",
+        "scilab_rl.envs.mazes:AntMaze",
+        500,
+        f"AntGym-{_REWARD_GRAMMAR}-FRAME_SKIP-{_PLACE_GRAMMAR}",
+        rf"AntGym{_REWARD}-(?P<frame_skip>[1-9]\d*){_PLACE}",
+        _read_maze,
     ),
 )
 

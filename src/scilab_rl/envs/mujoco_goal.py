@@ -5,7 +5,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar
+from types import MappingProxyType
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -38,7 +39,7 @@ class MujocoGoalEnv(GoalEnv):
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 25}  # noqa: RUF012 - Gymnasium's
-    camera: ClassVar[Mapping[str, Any]] = {}
+    camera: Mapping[str, Any] = MappingProxyType({})
 
     def __init__(
         self,
