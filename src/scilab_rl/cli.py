@@ -43,8 +43,11 @@ def run_command_line(arguments: list[str]) -> int:
     130: interrupted.
     """
     debug = "--debug" in arguments
-    arguments = [argument for argument in arguments if argument != "--debug"]
+    trusts_pickle = "--trust-pickle" in arguments
+    flags = ("--debug", "--trust-pickle")
+    arguments = [argument for argument in arguments if argument not in flags]
     _set_up_messages(debug)
+    os.environ["SCILAB_RL_TRUST_PICKLE"] = str(int(trusts_pickle))  # see `training.foreign`
     try:
         return _dispatch(arguments)
     except ScilabRLError as error:

@@ -24,16 +24,53 @@ def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     options = _parse(arguments)
     open_desk()
-    run = find_run(options.run, options.base_logdir)
-    cfg = load_recorded(run / CONFIG_FILE)
+    run, cfg, policy = find_policy(options)
     seed = options.seed or int(cfg.seed) + 1
-    env, model = load_player(cfg, policy_folder(run, options), record=options.record)
+    env, model = load_player(cfg, policy, record=options.record)
     finish = film_first_episode(model, env, cfg, run, options.metrics) if options.record else None
     evaluation = _play(model, env, options, seed)
     video = finish() if finish is not None else None
     env.close()
     _report(evaluation, cfg, video)
     return 0
+
+
+def find_policy(options: argparse.Namespace) -> tuple[RunDirectory, Any, Path]:
+    """Return the run, its configuration and the saved policy that are to be played.
+
+    A zip of Stable-Baselines3 belongs to no run: what it was trained with is on the command line.
+
+    Raises:
+        ConfigError: If there is no such policy, or it is a zip that is not trusted.
+    """
+    from scilab_rl.training import foreign
+
+    archive = foreign.find_archive(Path(options.run))
+    if archive is not None:
+        foreign.refuse_untrusted(archive)
+        return RunDirectory(archive.parent), _composed_for(archive, options.overrides), archive
+    if options.overrides:
+        raise ConfigError(
+            f"'{options.overrides[0]}' is for zips of Stable-Baselines3; a run is played as it was "
+            "trained."
+        )
+    run = find_run(options.run, options.base_logdir)
+    return run, load_recorded(run / CONFIG_FILE), policy_folder(run, options)
+
+
+def _composed_for(archive: Path, overrides: list[str]) -> Any:
+    import hydra
+
+    from scilab_rl.config import compose, friendly_override
+
+    given = {override.partition("=")[0] for override in overrides}
+    if not {"algorithm", "env"} <= given:
+        raise ConfigError(
+            f"What was '{archive}' trained with? For example: "
+            f"scilab-rl play {archive} algorithm=sac env=FetchReach --trust-pickle"
+        )
+    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
+        return compose([friendly_override(override) for override in overrides])
 
 
 def policy_folder(run: RunDirectory, options: argparse.Namespace) -> Path:
@@ -98,6 +135,12 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         description="Let a trained policy act and report its success rate with a 95 % interval.",
     )
     parser.add_argument("run", help="'last', the path of a run or policy, or a part of its name")
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="KEY=VALUE",
+        help="for a zip of Stable-Baselines3 (with --trust-pickle): algorithm=sac env=FetchReach",
+    )
     parser.add_argument("--episodes", type=_positive, default=10, help="how many (default 10)")
     parser.add_argument("--record", action="store_true", help="film the first episode")
     parser.add_argument(

@@ -10,7 +10,6 @@ import json
 import os
 import platform
 import shutil
-import zipfile
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -80,7 +79,7 @@ def verify(directory: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: If it does not hold.
     """
-    _refuse_foreign_formats(directory)
+    _require_directory(directory)
     try:
         manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
         entries = [
@@ -116,12 +115,7 @@ def _present(directory: Path) -> Path:
     return previous if not directory.exists() and previous.is_dir() else directory
 
 
-def _refuse_foreign_formats(directory: Path) -> None:
-    if directory.is_file() and zipfile.is_zipfile(directory):
-        raise ConfigError(
-            f"'{directory}' is a zip of Stable-Baselines3, which runs code when it is loaded "
-            "(pickle). If you trust its source, add --trust-pickle."
-        )
+def _require_directory(directory: Path) -> None:
     if not directory.is_dir():
         raise ConfigError(f"There is no saved policy in '{directory}'.")
 

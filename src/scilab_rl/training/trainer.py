@@ -26,7 +26,7 @@ from scilab_rl.metrics.logger import MetricLogger
 from scilab_rl.metrics.store import MetricStore
 from scilab_rl.seeding import derive_seed
 from scilab_rl.tracking.base import Tracker
-from scilab_rl.training import checkpoint, resume
+from scilab_rl.training import checkpoint, foreign, resume
 from scilab_rl.training.evaluation import evaluate
 from scilab_rl.training.interruption import StopRequest, TrainingInterrupted
 from scilab_rl.training.snapshot import Snapshot, capture, restore
@@ -258,10 +258,19 @@ class Trainer(BaseCallback):
 def load_policy(model: Any, directory: Path) -> None:
     """Put a saved policy, with its optimizers and normalisation, into an algorithm.
 
+    Args:
+        model: The algorithm.
+        directory: As `Trainer.save_policy` writes it; or a zip of Stable-Baselines3, if the user
+            trusts it.
+
     Raises:
         CheckpointError: If the policy is damaged or was saved by another algorithm.
+        ConfigError: If there is none, or it is a zip that is not trusted.
     """
-    restore(policy_state(model), checkpoint.load(directory))
+    if (archive := foreign.find_archive(directory)) is not None:
+        foreign.load_archive(model, archive)
+    else:
+        restore(policy_state(model), checkpoint.load(directory))
 
 
 def policy_state(model: Any) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import torch
 
 from scilab_rl import files
 from scilab_rl.errors import CheckpointError, ConfigError
-from scilab_rl.training import checkpoint
+from scilab_rl.training import checkpoint, foreign
 from scilab_rl.training.snapshot import Snapshot, capture, restore
 
 
@@ -228,6 +228,8 @@ def test_a_foreign_zip_is_refused_with_the_way_to_allow_it(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("data", "{}")
     with pytest.raises(ConfigError, match="--trust-pickle"):
+        foreign.load_archive(None, path)
+    with pytest.raises(ConfigError, match="no saved policy"):
         checkpoint.load(path)
 
 
@@ -240,7 +242,7 @@ WRITER = """
     import sys
     from pathlib import Path
     import numpy as np, torch
-    from scilab_rl.training import checkpoint
+    from scilab_rl.training import checkpoint, foreign
     from scilab_rl.training.snapshot import capture
     for number in range(10_000):
         state = {"weights": torch.full((50_000,), float(number)), "step": number}
