@@ -8,6 +8,7 @@ recording, and must agree in every scene.
 from __future__ import annotations
 
 import dataclasses
+import io
 import re
 import subprocess
 import sys
@@ -21,12 +22,21 @@ from PIL import Image
 from scilab_rl.testing import decode_frame
 from scilab_rl.visualization import movie
 from scilab_rl.visualization.archive import load_clip
+from scilab_rl.visualization.live import LiveViewer
 from scilab_rl.visualization.movie import HEADER, MovieFrames
 from scilab_rl.visualization.panels import COLOURS
-from scilab_rl.visualization.records import Clip, decode_picture
+from scilab_rl.visualization.records import (
+    Clip,
+    ClipInfo,
+    Record,
+    decode_picture,
+    encode_picture,
+)
 
 from .chromium import EXECUTABLE, Chromium
 from .commands import last_run, quiet_environment
+
+pytestmark = pytest.mark.slow
 
 ENV = "scilab_rl.testing:TinyPixels-v0"
 N_STEPS = 10  # of an episode of TinyPixels
@@ -193,6 +203,34 @@ def test_page_shows_the_numbers_of_its_scene(clips: list[Path]) -> None:
                         assert text == "–", (name, step)
                 assert wanted.keys() <= texts.keys()
                 browser.press("ArrowRight")
+
+
+def test_live_view_draws_scene_and_curves_in_the_browser() -> None:
+    pytest.importorskip("rerun")
+    pytest.importorskip("aiohttp")
+    if EXECUTABLE is None:
+        pytest.skip("needs chromium")
+    info = ClipInfo("x", "eval", 1, "Tiny-v0", "sac", 25.0, ("reward",))
+    picture = encode_picture(np.full((480, 480, 3), (255, 0, 255), np.uint8))
+    viewer = LiveViewer(info.panels, window=False)
+    try:
+        viewer.begin(info)
+        for step in range(30):
+            record = Record("eval", 0, 0, step, step, picture, np.zeros(1), np.zeros(1), 1.0)
+            record.values = {"reward": float(step)}
+            viewer.add(record)
+
+        def n_pixels(colour: tuple[int, int, int]) -> int:
+            with Image.open(io.BytesIO(browser.screenshot())) as image:
+                pixels = np.asarray(image.convert("RGB")).astype(int)
+            return int((np.abs(pixels - colour).max(axis=2) < 40).sum())
+
+        with Chromium() as browser:
+            browser.open(str(viewer.address))
+            browser.wait_until(lambda: n_pixels((255, 0, 255)) > 100_000, seconds=90)
+            browser.wait_until(lambda: n_pixels((37, 99, 235)) > 200, seconds=30)
+    finally:
+        viewer.close()
 
 
 _SCENE_PIXELS = """(async () => {

@@ -106,7 +106,8 @@ def test_return_so_far_adds_up_and_begins_anew_with_each_episode() -> None:
     for _ in range(2):
         episode = EpisodeProbes(EVERYTHING, probes, pytest.fail)
         totals = [
-            episode.of_step(OBSERVATION, None, reward)["return_so_far"] for reward in (1.0, 2.0, 4.0)
+            episode.of_step(OBSERVATION, None, reward)["return_so_far"]
+            for reward in (1.0, 2.0, 4.0)
         ]
         assert totals == [1.0, 3.0, 7.0]
 
@@ -141,7 +142,7 @@ def test_random_can_answer_only_what_the_environment_knows() -> None:
 
 
 def test_unknown_name_gets_a_suggestion() -> None:
-    with pytest.raises(ConfigError, match="no metric 'critc_variance'. Did you mean 'critic_var"):
+    with pytest.raises(ConfigError, match=r"no metric 'critc_variance'\. Did you mean 'critic_var"):
         resolve("critc_variance")
     with pytest.raises(ConfigError, match="Did you mean 'train/critic_loss'"):
         resolve("train/critic_los", recorded=["train/critic_loss"])
@@ -207,9 +208,9 @@ def test_failing_probe_is_reported_once_and_a_gap(own: types.ModuleType) -> None
 
 
 def test_own_probes_that_cannot_be(own: types.ModuleType, tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="no 'surprize' in my_probes. Did you mean 'surprise'"):
+    with pytest.raises(ConfigError, match=r"no 'surprize' in my_probes\. Did you mean 'surprise'"):
         resolve("my_probes.surprize")
-    with pytest.raises(ConfigError, match="'nowhere.x' cannot be imported"):
+    with pytest.raises(ConfigError, match=r"'nowhere\.x' cannot be imported"):
         resolve("nowhere.x")
     with pytest.raises(ConfigError, match="takes 0 arguments, but a probe takes the first of"):
         resolve("my_probes.nothing")

@@ -1,0 +1,131 @@
+"""The live view: on this machine only, and never in the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+import urllib.request
+from collections.abc import Iterator
+
+import psutil
+import pytest
+
+from scilab_rl.visualization.live import LiveViewer, free_port, has_display
+from scilab_rl.visualization.records import Record
+
+from .clips import make_clip
+
+pytest.importorskip("rerun")
+
+
+@pytest.fixture
+def viewer() -> Iterator[LiveViewer]:
+    viewer = LiveViewer(("reward", "q_values"), window=False)
+    yield viewer
+    viewer.close()
+
+
+def show(viewer: LiveViewer, n_episodes: int) -> None:
+    clip = make_clip()
+    for _ in range(n_episodes):
+        viewer.begin(clip.info)
+        for record in clip.records:
+            viewer.add(record)
+        viewer.end()
+
+
+def listening_addresses(*processes: psutil.Process) -> set[str]:
+    return {
+        connection.laddr.ip
+        for process in processes
+        for connection in process.net_connections("tcp")
+        if connection.status == psutil.CONN_LISTEN
+    }
+
+
+def wait_for_page(viewer: LiveViewer) -> None:
+    deadline = time.monotonic() + 20
+    assert viewer.address is not None
+    while time.monotonic() < deadline:
+        try:
+            with urllib.request.urlopen(viewer.address, timeout=2) as page:
+                assert page.status == 200
+                return
+        except OSError:
+            time.sleep(0.1)
+    pytest.fail("the page is not served")
+
+
+def test_page_is_served_to_this_machine_only(viewer: LiveViewer) -> None:
+    wait_for_page(viewer)
+    show(viewer, 2)
+    assert viewer._child is not None
+    child = psutil.Process(viewer._child.pid)
+    assert listening_addresses(psutil.Process(), child) == {"127.0.0.1"}
+
+
+def test_child_ends_with_the_view() -> None:
+    viewer = LiveViewer(("reward",), window=False)
+    assert viewer._child is not None
+    pid = viewer._child.pid
+    assert psutil.pid_exists(pid)
+    viewer.close()
+    assert not psutil.pid_exists(pid)
+
+
+def test_stopped_and_killed_viewers_stop_nobody(viewer: LiveViewer) -> None:
+    wait_for_page(viewer)
+    assert viewer._child is not None
+    os.kill(viewer._child.pid, signal.SIGSTOP)
+    started = time.monotonic()
+    show(viewer, 100)
+    assert time.monotonic() - started < 2.0
+    os.kill(viewer._child.pid, signal.SIGKILL)
+    show(viewer, 1)
+
+
+def test_pictures_are_dropped_and_numbers_never(
+    viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the thread hangs in the viewer, training goes on; then all numbers arrive."""
+    written: list[tuple[float | None, bool]] = []
+    hanging = True
+
+    def slow_add(self: object, record: Record, *, with_picture: bool) -> None:
+        while hanging:
+            time.sleep(0.01)
+        written.append((record.reward, with_picture))
+
+    monkeypatch.setattr("scilab_rl.visualization.viewer_stream.ViewerStream.add", slow_add)
+    show(viewer, 40)
+    assert viewer.n_dropped_pictures > 100
+    hanging = False
+    deadline = time.monotonic() + 10
+    while len(written) < 40 * 5 and time.monotonic() < deadline:
+        time.sleep(0.01)
+    assert [reward for reward, _ in written] == [0.0, 1.0, 2.0, 3.0, None] * 40
+    assert sum(not with_picture for _, with_picture in written) == viewer.n_dropped_pictures
+
+
+def test_next_port_is_taken_when_one_is_not_free() -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        assert free_port(port) > port
+
+
+@pytest.mark.parametrize(
+    ("environment", "expected"), [({}, False), ({"DISPLAY": ":0"}, True), ({"DISPLAY": ""}, False)]
+)
+def test_display(
+    environment: dict[str, str], expected: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.platform", "linux")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in environment.items():
+        monkeypatch.setenv(name, value)
+    assert has_display() is expected
