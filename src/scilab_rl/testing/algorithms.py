@@ -40,9 +40,11 @@ from scilab_rl.training.snapshot import capture, random_state, restore, set_rand
 from scilab_rl.training.trainer import load_policy, policy_state
 
 # In the order of preference: the first one whose spaces the algorithm takes.
-_CANDIDATES = tuple(
-    f"scilab_rl.testing:{name}"
-    for name in ("TinyReach-v0", "TinyReachDiscrete-v0", "TinyBox-v0", "TinyDiscrete-v0")
+_WITHOUT_GOALS = ("scilab_rl.testing:TinyBox-v0", "scilab_rl.testing:TinyDiscrete-v0")
+_CANDIDATES = (
+    "scilab_rl.testing:TinyReach-v0",
+    "scilab_rl.testing:TinyReachDiscrete-v0",
+    *_WITHOUT_GOALS,
 )
 # Plumbing of Stable-Baselines3 and ours, which a YAML file may leave at its defaults.
 _PLUMBING = {
@@ -248,13 +250,17 @@ class AlgorithmContract:
         return make_train_env(settings).reset()
 
 
-def fitting_environment(cls: type) -> str:
+def fitting_environment(cls: type, *, with_goals: bool = True) -> str:
     """Return the id of the first tiny environment that an algorithm class can learn in.
+
+    Args:
+        cls: The class.
+        with_goals: Whether environments with goals count too.
 
     Raises:
         ConfigError: If there is none.
     """
-    for env_id in _CANDIDATES:
+    for env_id in _CANDIDATES if with_goals else _WITHOUT_GOALS:
         try:
             check_pair(cls.__name__, cls, env_id, make_single_env(EnvSettings(env_id)))
         except ConfigError as error:

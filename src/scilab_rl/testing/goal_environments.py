@@ -1,0 +1,52 @@
+"""The exam that every environment takes.
+
+An environment of your own takes it with three lines in a test file:
+
+.. code-block:: python
+
+    from scilab_rl.testing.goal_environments import EnvironmentContract
+
+    class TestMyReach(EnvironmentContract):
+        env = "MyReach-v0"
+
+The same checks are made by ``scilab-rl doctor env=MyReach-v0``, with what to do about each fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from functools import partial
+from typing import Any
+
+from scilab_rl.envs import fingerprint
+from scilab_rl.envs.examination import examine
+from scilab_rl.envs.vectorize import EnvSettings, make_single_env
+from scilab_rl.findings import FAIL, WARN
+
+
+class EnvironmentContract:
+    """Subclass it, name an environment, and pytest does the rest.
+
+    Attributes:
+        env: Its id.
+        env_kwargs: Its keyword arguments.
+        n_steps: Random steps on which rewards and endings are compared.
+        accepted: Checks whose warnings you know and accept.
+    """
+
+    env: str
+    env_kwargs: Mapping[str, Any] = {}
+    n_steps = 1000
+    accepted: tuple[str, ...] = ()
+
+    def test_doctor_finds_no_fault(self) -> None:
+        """Keys and shapes, rewards, success, endings, goals, seeds, pickling, stability."""
+        make = partial(make_single_env, EnvSettings(self.env, self.env_kwargs))
+        faults = [
+            f"{finding.check}: {finding.found} ({finding.fix})"
+            for finding in examine(
+                make, n_steps=self.n_steps, known_fingerprints=fingerprint.known(self.env)
+            )
+            if finding.result in (WARN, FAIL) and finding.check not in self.accepted
+        ]
+        assert faults == []
