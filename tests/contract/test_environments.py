@@ -25,17 +25,23 @@ SHIPPED = [family.env_id for family in FAMILIES if family.env_id != "AntGym-v0"]
 FETCH = ["FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4", "FetchSlide-v4"]
 
 
-@pytest.fixture(params=[*SHIPPED, *VARIANTS])
+SLOW = [pytest.param(env_id, marks=pytest.mark.slow) for env_id in VARIANTS]
+
+
+@pytest.fixture(params=[*SHIPPED, *SLOW])
 def shipped(request):
     request.instance.env = request.param
 
 
 @pytest.mark.usefixtures("shipped")
 class TestShipped(EnvironmentContract):
+    n_steps = 300
+
     def test_fingerprint_is_recorded(self) -> None:
         assert fingerprint.known(self.env)
 
 
+@pytest.mark.slow
 class TestAnt(EnvironmentContract):
     env = "AntGym-sparse-10-1.5-small_open_dgr-c1-rt0-s500-v0"
     n_steps = 300
@@ -49,9 +55,8 @@ def fetch(request):
     request.instance.env = request.param
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fetch")
 class TestFetch(EnvironmentContract):
-    n_steps = 300
-
     def test_fingerprint_is_recorded(self) -> None:
         assert fingerprint.known(self.env)

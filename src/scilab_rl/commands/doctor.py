@@ -1,4 +1,4 @@
-"""``scilab-rl doctor``: check the installation, and say how to repair what is wrong."""
+"""``scilab-rl doctor [env=ID ...]``: check the installation, or an environment."""
 
 from __future__ import annotations
 
@@ -10,16 +10,15 @@ import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
 
-from scilab_rl.commands.parser import CommandParser
+from scilab_rl.commands.parser import CommandParser, positive
 from scilab_rl.commands.tables import print_json, print_rows, write
 from scilab_rl.errors import RenderingError, ScilabRLError
+from scilab_rl.findings import FAIL, INFO, OK, WARN, Finding
 from scilab_rl.visualization import gl
-
-OK, INFO, WARN, FAIL = "ok", "info", "warn", "fail"
 
 # The fingerprints of FetchReach-v4 with gymnasium-robotics 1.4.2, and the versions of MuJoCo that
 # were found to give them: 3.3.0, 3.3.2, 3.3.7, 3.4.0, 3.5.0, 3.6.0. With 3.7.0 it is another one.
@@ -51,27 +50,19 @@ _PINNED = "pip install -c constraints.txt -e ."
 _LITTLE_SPACE_BYTES, _NO_SPACE_BYTES = 5 * 2**30, 2**28
 
 
-@dataclass(frozen=True)
-class Finding:
-    """One line of the report.
-
-    Attributes:
-        check: What was looked at.
-        result: ``ok``, ``info`` (optional and not there), ``warn`` (something will not work) or
-            ``fail`` (do not train before it is repaired).
-        found: What is there.
-        fix: What to do about it.
-    """
-
-    check: str
-    result: str
-    found: str
-    fix: str | None = None
-
-
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code: 0 when nothing fails, else 1."""
-    parser = CommandParser("doctor", "Check the installation and say how to repair it.")
+    parser = CommandParser(
+        "doctor",
+        "Check the installation, or with env=ID an environment, and say how to repair it.",
+    )
+    parser.add_argument(
+        "overrides",
+        nargs="*",
+        metavar="env=ID",
+        help="an environment, with env_kwargs and wrappers",
+    )
+    parser.add_argument("--steps", type=positive, default=1000, help="random steps in it (1000)")
     parser.add_argument("--rendering-hint", action="store_true", help="check only the pictures")
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(arguments)
@@ -79,7 +70,12 @@ def main(arguments: list[str]) -> int:
         _print_rendering_hint()
         return 0
 
-    findings = list(examine())
+    if options.overrides:
+        from scilab_rl.commands import doctor_env
+
+        findings = doctor_env.examine(options.overrides, options.steps)
+    else:
+        findings = list(examine())
     if options.json:
         print_json([asdict(finding) for finding in findings])
     else:

@@ -72,15 +72,11 @@ class Blocks(FetchTask):
         return self._random_place()
 
     def sample_goal(self) -> np.ndarray:
-        """Draw the tower's place, and the gripper's above it."""
-        x, y = self._random_place()
-        heights = TABLE_HEIGHT + BLOCK_SIZE * (np.arange(self.n_blocks + 1) + 0.5)
-        tower = [np.array([x, y, height]) for height in heights]
-        free = tower.pop()  # where the next block would be
-        if self.gripper_goal == "random":
-            free = np.array([*self._random_place(), free[2] + self.np_random.uniform(0.0, 0.2)])
-        parts = tower if self.gripper_goal == "none" else [free, *tower]
-        return np.concatenate(parts)
+        """Draw a tower that does not stand already."""
+        goal = self._draw_goal()
+        while self.distance(self.achieved_goal(), goal) <= self.threshold:
+            goal = self._draw_goal()
+        return goal
 
     def achieved_goal(self) -> np.ndarray:
         """Return the places of the gripper, if it counts, and of the blocks."""
@@ -122,6 +118,17 @@ class Blocks(FetchTask):
         if self.gripper_goal != "none":
             names.insert(0, "gripper_goal")
         return dict(zip(names, parts, strict=True))
+
+    def _draw_goal(self) -> np.ndarray:
+        """Draw the tower's place, and the gripper's above it. Shapes: ``(3 n_parts,)``."""
+        x, y = self._random_place()
+        heights = TABLE_HEIGHT + BLOCK_SIZE * (np.arange(self.n_blocks + 1) + 0.5)
+        tower = [np.array([x, y, height]) for height in heights]
+        free = tower.pop()  # where the next block would be
+        if self.gripper_goal == "random":
+            free = np.array([*self._random_place(), free[2] + self.np_random.uniform(0.0, 0.2)])
+        parts = tower if self.gripper_goal == "none" else [free, *tower]
+        return np.concatenate(parts)
 
     def _random_place(self) -> np.ndarray:
         return self.start[:2] + self.np_random.uniform(-self.work_range, self.work_range, 2)

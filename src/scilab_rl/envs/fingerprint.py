@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import json
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
+KNOWN = Path(__file__).parent / "assets" / "fingerprints.json"
 SEED = 1234
 N_STEPS = 20
 DECIMALS = 5
@@ -33,6 +36,16 @@ def fingerprint(env: gym.Env) -> str:
         if terminated:
             break
     return digest.hexdigest()[:16]
+
+
+def known(env_id: str) -> tuple[str, ...]:
+    """Return the fingerprints that an environment has with the pinned versions, if we know any.
+
+    Args:
+        env_id: An id with its version.
+    """
+    recorded = json.loads(KNOWN.read_text(encoding="utf-8"))
+    return tuple(recorded.get(env_id, ()))
 
 
 def scripted_action(space: gym.Space, rng: np.random.Generator) -> Any:

@@ -24,6 +24,7 @@ from scilab_rl.envs.frames import FrameCapture
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.envs.replayable import ReplayableEpisode
+from scilab_rl.envs.stability import guard
 from scilab_rl.errors import ConfigError, EnvironmentError_, ScilabRLError, did_you_mean
 from scilab_rl.seeding import derive_seed
 
@@ -82,6 +83,7 @@ def make_single_env(settings: EnvSettings) -> gym.Env:
         # An environment that draws nothing need not have the parameter.
         rendering = {"render_mode": settings.render_mode} if settings.render_mode else {}
         env = gym.make(settings.env_id, **(rendering | dict(settings.env_kwargs)))
+        env = guard(env)
         for wrapper in settings.wrappers:
             if not _wraps_vectors(wrapper):
                 env = wrapper(env)

@@ -1,0 +1,111 @@
+"""A random policy's steps, recorded in full, for the doctor to look at."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from scilab_rl.envs.fingerprint import scripted_action
+from scilab_rl.metrics.success import success_of
+
+
+@dataclass
+class Rehearsal:
+    """Everything that happened in a number of steps.
+
+    Attributes:
+        observations: After each step. Shapes: ``n_steps`` entries.
+        rewards: Shapes: ``(n_steps,)``.
+        terminated: Shapes: ``(n_steps,)``.
+        truncated: Shapes: ``(n_steps,)``.
+        infos: One dictionary per step.
+        first_observations: One per episode.
+        first_successes: Whether the goal was reached at the reset; only where info says so.
+        lengths: Steps of each finished episode.
+        final_successes: Success at the end of each finished episode; only where info says so.
+        step_seconds: Wall time of all steps.
+        reset_seconds: Wall time of all resets.
+    """
+
+    observations: list[Any] = field(default_factory=list)
+    rewards: list[float] = field(default_factory=list)
+    terminated: list[bool] = field(default_factory=list)
+    truncated: list[bool] = field(default_factory=list)
+    infos: list[dict[str, Any]] = field(default_factory=list)
+    first_observations: list[Any] = field(default_factory=list)
+    first_successes: list[bool] = field(default_factory=list)
+    lengths: list[int] = field(default_factory=list)
+    final_successes: list[bool] = field(default_factory=list)
+    step_seconds: float = 0.0
+    reset_seconds: float = 0.0
+
+    @property
+    def successes(self) -> list[bool | None]:
+        """Success at each step; None where the task has no such notion."""
+        return [success_of(info) for info in self.infos]
+
+    def goals(self, key: str) -> np.ndarray:
+        """Return all achieved or desired goals. Shapes: ``(n_steps, goal_size)``."""
+        return np.array([observation[key] for observation in self.observations])
+
+
+def rehearse(env: gym.Env, n_steps: int, seed: int) -> Rehearsal:
+    """Act at random for a number of steps, over as many episodes as that takes.
+
+    Args:
+        env: With its step limit.
+        n_steps: How many.
+        seed: Of the environment and of the actions.
+    """
+    rehearsal, rng = Rehearsal(), np.random.default_rng(seed)
+    _reset(env, rehearsal, seed)
+    length = 0
+    for _ in range(n_steps):
+        action = scripted_action(env.action_space, rng)
+        started = time.perf_counter()
+        observation, reward, terminated, truncated, info = env.step(action)
+        rehearsal.step_seconds += time.perf_counter() - started
+        rehearsal.observations.append(observation)
+        rehearsal.rewards.append(float(reward))
+        rehearsal.terminated.append(bool(terminated))
+        rehearsal.truncated.append(bool(truncated))
+        rehearsal.infos.append(info)
+        length += 1
+        if terminated or truncated:
+            rehearsal.lengths.append(length)
+            success = success_of(info)
+            if success is not None:
+                rehearsal.final_successes.append(success)
+            _reset(env, rehearsal)
+            length = 0
+    return rehearsal
+
+
+def _reset(env: gym.Env, rehearsal: Rehearsal, seed: int | None = None) -> None:
+    started = time.perf_counter()
+    observation, info = env.reset(seed=seed)
+    rehearsal.reset_seconds += time.perf_counter() - started
+    rehearsal.first_observations.append(observation)
+    success = success_at(env, observation, info)
+    if success is not None:
+        rehearsal.first_successes.append(success)
+
+
+def success_at(env: gym.Env, observation: Any, info: dict[str, Any]) -> bool | None:
+    """Return whether the goal is reached already, as the info, or else the reward, tells it.
+
+    Args:
+        env: The environment.
+        observation: Of a reset.
+        info: Of a reset; many environments say nothing there.
+    """
+    success = success_of(info)
+    reward = getattr(env.unwrapped, "compute_reward", None)
+    if success is not None or reward is None or not isinstance(observation, dict):
+        return success
+    achieved, desired = observation["achieved_goal"], observation["desired_goal"]
+    return bool(reward(achieved, desired, info) >= reward(achieved, achieved, info))
