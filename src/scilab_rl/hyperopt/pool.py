@@ -6,6 +6,7 @@ import multiprocessing
 import os
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -39,11 +40,15 @@ class Pool:
     Args:
         size: Most workers at the same time.
         log_dir: Folder for what they print.
+        main: What a worker does; the same protocol as `worker.main`.
     """
 
-    def __init__(self, size: int, log_dir: Path) -> None:
+    def __init__(
+        self, size: int, log_dir: Path, main: Callable[[Connection, str, int], None] = worker.main
+    ) -> None:
         self.size = size
         self.log_dir = log_dir
+        self.main = main
         self.n_threads = max(1, n_cores() // size)
         self.busy_seconds = 0.0
         self._workers: list[Worker] = []
@@ -148,7 +153,7 @@ class Pool:
         ours, theirs = self._context.Pipe()
         log = self.log_dir / f"worker-{os.getpid()}-{len(self._workers)}.log"
         # No daemon: a run may have environment processes of its own.
-        process = self._context.Process(target=worker.main, args=(theirs, str(log), self.n_threads))
+        process = self._context.Process(target=self.main, args=(theirs, str(log), self.n_threads))
         process.start()
         theirs.close()
         self._workers.append(Worker(process, ours))

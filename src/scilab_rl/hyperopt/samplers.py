@@ -7,7 +7,6 @@ import warnings
 from typing import TYPE_CHECKING
 
 from scilab_rl.errors import MissingDependencyError
-from scilab_rl.seeding import derive_seed
 
 if TYPE_CHECKING:
     import optuna
@@ -30,37 +29,36 @@ def require_packages(sampler: str) -> None:
             raise MissingDependencyError(package, "hyperopt", f"for the sampler {sampler}")
 
 
-def make_sampler(name: str, seed: int, trial_number: int) -> optuna.samplers.BaseSampler:
-    """Return the sampler for one trial.
+def make_sampler(name: str, study_seed: int, draw_seed: int) -> optuna.samplers.BaseSampler:
+    """Return the sampler for one draw.
 
-    Its seed depends on the trial's number, so that a study that was killed and resumed draws what
-    the uninterrupted one would have drawn. Low-discrepancy sequences keep one seed, because they
-    count their points in the storage.
+    Each draw has a seed of its own, so that a study that was killed and resumed draws what the
+    uninterrupted one would have drawn. Low-discrepancy sequences keep the study's seed, because
+    they count their points in the storage.
 
     Args:
         name: A key of `SAMPLERS`; the settings of ``grid`` are listed elsewhere.
-        seed: Seed of the study.
-        trial_number: Number of the trial that the sampler is for.
+        study_seed: Seed of the study.
+        draw_seed: Seed of this draw.
     """
     import optuna
 
-    trial_seed = derive_seed(seed, "sampler", trial_number)
     samplers = optuna.samplers
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         if name == "tpe":
-            return samplers.TPESampler(seed=trial_seed)
+            return samplers.TPESampler(seed=draw_seed)
         if name == "cmaes":
-            return samplers.CmaEsSampler(seed=trial_seed, warn_independent_sampling=False)
+            return samplers.CmaEsSampler(seed=draw_seed, warn_independent_sampling=False)
         if name == "nsgaii":
-            return samplers.NSGAIISampler(seed=trial_seed)
+            return samplers.NSGAIISampler(seed=draw_seed)
         if name == "gp":
-            return samplers.GPSampler(seed=trial_seed, warn_independent_sampling=False)
+            return samplers.GPSampler(seed=draw_seed, warn_independent_sampling=False)
         if name == "qmc":
             return samplers.QMCSampler(
-                seed=seed,
+                seed=study_seed,
                 scramble=True,
-                independent_sampler=samplers.RandomSampler(trial_seed),
+                independent_sampler=samplers.RandomSampler(draw_seed),
                 warn_independent_sampling=False,
             )
-        return samplers.RandomSampler(trial_seed)
+        return samplers.RandomSampler(draw_seed)

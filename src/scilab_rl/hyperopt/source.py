@@ -13,6 +13,7 @@ from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.race import RaceRules
 from scilab_rl.hyperopt.samplers import make_sampler
 from scilab_rl.hyperopt.space import SearchSpace, Setting
+from scilab_rl.seeding import derive_seed
 
 _MOST_LISTED = 10_000
 _MOST_DUPLICATES = 20
@@ -54,11 +55,16 @@ class SettingsSource:
         """Return how many settings have not been tried."""
         return len(self._untried()) if self._listed else math.inf
 
-    def ask(self) -> int | None:
-        """Return the number of a new trial with a setting of its own, or None when none is left."""
-        for _ in range(0 if self.is_exhaustive else _MOST_DUPLICATES):
+    def ask(self, n_settings: int) -> int | None:
+        """Return the number of a new trial with a setting of its own, or None when none is left.
+
+        Args:
+            n_settings: How many settings there are. It makes the draw reproducible, whatever a
+                crash has left among the trials.
+        """
+        for attempt in range(0 if self.is_exhaustive else _MOST_DUPLICATES):
             earlier = settings_of(self.ledger.trials())
-            number, setting = self._ask()
+            number, setting = self._ask(n_settings, attempt)
             if setting not in earlier.values():
                 return number
             self.ledger.study.tell(number, state=TrialState.FAIL)
@@ -67,7 +73,7 @@ class SettingsSource:
             return None
         if not self.ledger.trials(TrialState.WAITING):
             self.ledger.study.enqueue_trial(untried[0])
-        return self._ask()[0]
+        return self._ask(n_settings, _MOST_DUPLICATES)[0]
 
     def discard_torn(self) -> None:
         """Give up trials whose process was killed while it was asking the sampler."""
@@ -75,9 +81,10 @@ class SettingsSource:
             if len(trial.params) < len(self._expected(trial.params)):
                 self.ledger.study.tell(trial.number, state=TrialState.FAIL)
 
-    def _ask(self) -> tuple[int, Setting]:
+    def _ask(self, n_settings: int, attempt: int) -> tuple[int, Setting]:
         study = self.ledger.study
-        study.sampler = make_sampler(self.sampler, self.seed, len(self.ledger.trials()))
+        draw_seed = derive_seed(self.seed, "sampler", n_settings, attempt)
+        study.sampler = make_sampler(self.sampler, self.seed, draw_seed)
         trial = study.ask()
         self.asked[trial.number] = trial
         return trial.number, self.space.suggest(trial)

@@ -172,7 +172,7 @@ class Study:
         if decision.action == race.RUN:
             return self._new_run(decision.number, self._next_repeat(decision.number))
         if decision.action == race.ASK:
-            number = self.source.ask()
+            number = self.source.ask(len(self._entries()))
             if number is not None:
                 return self._new_run(number, 0)
         if decision.action == race.DONE or not any(r.state == RUNNING for r in self.runs):
@@ -247,9 +247,6 @@ class Study:
         others_out = any(
             other.trial == run.trial and other.state in (PRUNED, FAILED) for other in self.runs
         )
-        if run.repeat == 0 and run.attempt == 0 and self.settings.rules.racing:
-            # What the sampler learns from a setting that is pruned.
-            self.source.asked[run.trial].report(value, epoch)
         return not (hopeless or others_out)
 
     def _outcome(self, run: Run, content: Mapping[str, Any]) -> Run:
@@ -297,11 +294,21 @@ class Study:
                 continue
             runs = [run for run in self.runs if run.trial == entry.number]
             if entry.out and not entry.n_running:
-                pruned = all(run.state != FAILED for run in runs)
-                state = TrialState.PRUNED if pruned else TrialState.FAIL
-                self.ledger.study.tell(entry.number, state=state)
+                self._tell_out(entry.number, runs)
             elif not entry.out and len(entry.scores) >= self.settings.min_trials_per_param:
                 self.ledger.study.tell(entry.number, _mean_scores(runs))
+
+    def _tell_out(self, trial: int, runs: Sequence[Run]) -> None:
+        """Tell the sampler about a setting that failed or was pruned."""
+        if any(run.state == FAILED for run in runs):
+            self.ledger.study.tell(trial, state=TrialState.FAIL)
+            return
+        asked = self.source.asked.get(trial)
+        pruned = next(run for run in runs if run.state == PRUNED)
+        if asked is not None:  # how bad it was is what the sampler learns
+            for epoch, value in enumerate(pruned.values, start=1):
+                asked.report(value, epoch)
+        self.ledger.study.tell(trial, state=TrialState.PRUNED)
 
     def _note_reasons_to_stop(self) -> None:
         self.pruning.learn_from(self.runs)

@@ -1,0 +1,292 @@
+"""Studies with real worker processes and real storage, whose runs are formulas."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from pathlib import Path
+
+import pytest
+from optuna.trial import TrialState
+
+from scilab_rl.hyperopt.ledger import DATABASE, STOP_FILE, Ledger
+from scilab_rl.hyperopt.runs import COMPLETE, FAILED, LOST, PRUNED, RUNNING
+from scilab_rl.hyperopt.source import settings_of
+
+from . import toy
+
+ROOT = Path(__file__).parents[3]
+
+
+def searched(study):
+    """The runs of the search, without the re-evaluation of the winner."""
+    return [run for run in study.runs if not run.is_final]
+
+
+def test_spends_exactly_its_budget_and_pairs_the_seeds(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", pruner="none")
+    runs = searched(study)
+    assert len(runs) == 12
+    assert {run.state for run in study.runs} == {COMPLETE}
+    seeds = {}
+    for run in runs:
+        seeds.setdefault(run.repeat, set()).add(run.seed)
+    assert all(len(of_repeat) == 1 for of_repeat in seeds.values())
+    assert len(set.union(*seeds.values())) == len(seeds)
+    per_setting = Counter(run.trial for run in runs)
+    assert min(per_setting.values()) == 2
+    told = study.ledger.trials(TrialState.COMPLETE)
+    assert {trial.number for trial in told} == set(per_setting)
+
+
+def test_winner_is_re_evaluated_with_seeds_of_its_own(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", n_final_runs=3, pruner="none")
+    finals = [run for run in study.runs if run.is_final]
+    assert [run.trial for run in finals] == [study.winner()] * 3
+    assert not {run.seed for run in finals} & {run.seed for run in searched(study)}
+
+
+def test_small_space_is_tried_completely_and_then_raced(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", space=toy.CHOICES, max_trials=16, pruner="none")
+    settings = settings_of(study.ledger.trials())
+    assert sorted(s["x"] for s in settings.values()) == [0.0, 0.25, 0.5, 0.75, 1.0]
+    assert settings[study.winner()]["x"] in (0.5, 0.75)
+    runs = Counter(settings[run.trial]["x"] for run in searched(study))
+    assert runs[0.0] == 2, "0.0 is far behind and must not earn further repeats"
+
+
+def test_one_worker_draws_the_same_settings_after_a_kill(tmp_path: Path) -> None:
+    whole = toy.run(tmp_path / "whole", n_workers=1, max_trials=8)
+    part = toy.run(tmp_path / "parts", n_workers=1, max_trials=8, max_duration_minutes=1e-4)
+    assert not part.runs
+    process = start(tmp_path / "parts", 8, n_workers=1)
+    wait_for_runs(tmp_path / "parts", 3)
+    process.kill()
+    process.communicate()
+    resumed = toy.run(tmp_path / "parts", n_workers=1, max_trials=8)
+    wanted, found = map(settings_and_scores, (whole, resumed))
+    assert found == wanted
+
+
+@pytest.mark.parametrize("fault", ["kill", "segfault", "exit"])
+def test_dead_worker_is_replaced_and_its_run_repeated(fault: str, tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", f"die={fault}", f"once={tmp_path / 'died'}", max_trials=4)
+    assert {run.state for run in study.runs} == {COMPLETE}
+    assert [run.attempt for run in study.runs].count(1) == 1
+    assert len(searched(study)) == 4
+
+
+def test_run_that_always_kills_its_worker_fails_and_never_scores(tmp_path: Path) -> None:
+    study = toy.run(
+        tmp_path / "study", "die=kill", "where=0.75", space=toy.CHOICES, max_retries=1,
+        max_trials=14,
+    )  # fmt: skip
+    bad = [run for run in study.runs if run.state == FAILED]
+    settings = settings_of(study.ledger.trials())
+    assert {settings[run.trial]["x"] for run in bad} == {0.75}
+    assert all(run.attempt == 1 and "SIGKILL" in run.error and not run.scores for run in bad)
+    assert settings[study.winner()]["x"] != 0.75
+    told = [t.number for t in study.ledger.trials(TrialState.FAIL)]
+    assert told == [bad[0].trial]
+
+
+def test_hanging_run_is_killed_after_its_timeout(tmp_path: Path) -> None:
+    study = toy.run(
+        tmp_path / "study", "die=hang", "where=0.25", space=toy.CHOICES, trial_timeout=1,
+        max_trials=10,
+    )  # fmt: skip
+    late = [run for run in study.runs if run.state == FAILED]
+    assert late
+    assert all("trial_timeout" in run.error for run in late)
+
+
+@pytest.mark.parametrize("direction", ["maximize", "minimize"])
+def test_nan_never_wins(direction: str, tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", "nan=1", direction=direction, fail_fast=0, max_trials=4)
+    assert {run.state for run in study.runs} == {FAILED}
+    assert "no finite number" in study.runs[0].error
+    assert study.winner() is None
+
+
+def test_ends_early_when_the_first_runs_fail_alike(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", "error=boom at step 3", max_trials=40)
+    assert "first 5 runs all failed: boom" in study.stop.reason
+    assert len(study.runs) <= 6
+    assert study.winner() is None
+
+
+def test_hopeless_runs_are_pruned_and_their_settings_are_out(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", max_trials=26, pruner="median", pruner_warmup_epochs=1)
+    pruned = [run for run in study.runs if run.state == PRUNED]
+    assert pruned
+    assert all(1 < len(run.values) < toy.N_EPOCHS for run in pruned if run.repeat == 0)
+    assert study.winner() not in {run.trial for run in pruned}
+    out = {run.trial for run in pruned}
+    told = {trial.number for trial in study.ledger.trials(TrialState.PRUNED)}
+    assert told == out
+
+
+def test_several_objectives_give_every_setting_the_same_repeats(tmp_path: Path) -> None:
+    study = toy.run(
+        tmp_path / "study", score=["final", "steps_to_threshold"],
+        direction=["maximize", "minimize"], max_trials=6,
+    )  # fmt: skip
+    assert {len(run.scores) for run in study.runs} == {2}
+    assert set(Counter(run.trial for run in study.runs).values()) == {2}
+    assert study.ledger.study.best_trials
+
+
+def test_deleted_stop_file_ends_the_study_after_the_running_runs(tmp_path: Path) -> None:
+    threading.Timer(1.5, (tmp_path / "study" / STOP_FILE).unlink).start()
+    study = toy.run(tmp_path / "study", "seconds=0.3", max_trials=200)
+    assert "stop file" in study.stop.reason
+    assert {run.state for run in study.runs} <= {COMPLETE, PRUNED}
+    assert 0 < len(study.runs) < 100
+
+
+def test_duration_ends_the_study_after_the_running_runs(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", "seconds=0.3", max_trials=200, max_duration_minutes=0.02)
+    assert study.stop.reason == "stopped after 0.02 minutes"
+    assert {run.state for run in study.runs} <= {COMPLETE, PRUNED}
+
+
+def test_ctrl_c_ends_the_study_after_the_running_runs(tmp_path: Path) -> None:
+    process = start(tmp_path / "study", 200)
+    wait_for_runs(tmp_path / "study", 3)
+    os.killpg(process.pid, signal.SIGINT)
+    output, _ = process.communicate(timeout=20)
+    assert output == "stopped by SIGINT\n"
+    assert {run.state for run in Ledger(tmp_path / "study").runs()} <= {COMPLETE, PRUNED}
+
+
+def test_killed_parent_takes_its_workers_along_and_loses_nothing(tmp_path: Path) -> None:
+    process = start(tmp_path / "study", 10)
+    wait_for_runs(tmp_path / "study", 3)
+    children = descendants(process.pid)
+    assert children
+    process.kill()
+    process.communicate()
+    before = {r.number: r for r in Ledger(tmp_path / "study").runs() if r.state == COMPLETE}
+    assert wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in children))
+    study = toy.run(tmp_path / "study", max_trials=10)
+    after = {run.number: run for run in study.runs}
+    assert all(after[number] == run for number, run in before.items())
+    assert [run.number for run in study.runs] == list(range(11))
+    assert not [run for run in study.runs if run.state in (RUNNING, LOST)]
+
+
+def test_database_with_leftovers_of_a_crash_opens(tmp_path: Path) -> None:
+    toy.run(tmp_path / "study", max_trials=4)
+    (tmp_path / "study" / f"{DATABASE}-journal").write_bytes(b"torn")
+    (tmp_path / "study" / "locks" / "1-dead.lease").touch()
+    study = toy.run(tmp_path / "study", max_trials=6)
+    assert len(searched(study)) == 6
+
+
+def test_two_parents_share_one_budget(tmp_path: Path) -> None:
+    processes = [start(tmp_path / "study", 12) for _ in range(2)]
+    outputs = [process.communicate(timeout=60) for process in processes]
+    assert [output for output, _ in outputs] == ["finished\n"] * 2, outputs
+    runs = Ledger(tmp_path / "study").runs()
+    assert len([run for run in runs if not run.is_final]) == 12
+    assert [run.number for run in runs] == list(range(13))
+    assert len({(run.trial, run.repeat) for run in runs}) == 13
+    assert len({run.owner for run in runs}) == 2
+
+
+@pytest.mark.slow
+def test_killed_again_and_again_ends_with_the_exact_total(tmp_path: Path) -> None:
+    """SIGKILL at random moments until it is done, as in Ray's stress test."""
+    import random
+
+    rng, n_kills = random.Random(0), 0
+    for _ in range(40):
+        process = start(tmp_path / "study", 30)
+        try:
+            process.communicate(timeout=rng.uniform(1.0, 4.0))
+            break
+        except subprocess.TimeoutExpired:
+            n_kills += 1
+            process.kill()
+            process.communicate()
+    runs = Ledger(tmp_path / "study").runs()
+    assert n_kills >= 3
+    assert len([run for run in runs if not run.is_final]) == 30
+    assert not [run for run in runs if run.state in (RUNNING, LOST)]
+    assert len({(run.trial, run.repeat) for run in runs}) == len(runs)
+
+
+@pytest.mark.slow
+def test_many_first_openings_and_shared_studies(tmp_path: Path) -> None:
+    for round_ in range(5):
+        folder = tmp_path / f"study{round_}"
+        processes = [start(folder, 10) for _ in range(8 if round_ == 0 else 2)]
+        for process in processes:
+            output, errors = process.communicate(timeout=120)
+            assert (output, "locked" in errors) == ("finished\n", False), errors
+        assert len([run for run in Ledger(folder).runs() if not run.is_final]) == 10
+
+
+@pytest.mark.slow
+def test_workers_are_busy_with_runs_of_unequal_length(tmp_path: Path) -> None:
+    """Runs of 1 to 5 seconds mixed: no barrier, so the workers hardly ever wait."""
+    space = toy.SearchSpace([
+        toy.Parameter("++x", "categorical", choices=(0.1, 0.2)),
+        toy.Parameter("++seconds", "categorical", choices=(1, 2, 3, 4, 5)),
+    ])  # fmt: skip
+    study = toy.run(
+        tmp_path / "study", space=space, max_trials=20, max_trials_per_param=2, pruner="none",
+        n_final_runs=0,
+    )  # fmt: skip
+    wall = max(run.started for run in study.runs) - min(run.started for run in study.runs)
+    # Until the last run starts, both workers should train all the time.
+    busy = sum(_overlap(run, study) for run in study.runs) / (2 * wall)
+    assert busy >= 0.95
+
+
+def _overlap(run, study) -> float:
+    last_start = max(other.started for other in study.runs)
+    seconds = settings_of(study.ledger.trials())[run.trial]["seconds"]
+    return max(0.0, min(run.started + seconds, last_start) - run.started)
+
+
+def settings_and_scores(study) -> list[tuple]:
+    settings = settings_of(study.ledger.trials())
+    return [(settings[run.trial], run.repeat, run.scores) for run in study.runs]
+
+
+def start(directory: Path, max_trials: int, n_workers: int = 2) -> subprocess.Popen:
+    numbers = map(str, (max_trials, n_workers))
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.unit.hyperopt.toy", str(directory), *numbers],
+        cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        start_new_session=True,
+    )  # fmt: skip
+
+
+def wait_for_runs(directory: Path, count: int) -> None:
+    def enough() -> bool:
+        done = (directory / DATABASE).exists() and Ledger(directory).runs()
+        return bool(done) and sum(run.state == COMPLETE for run in done) >= count
+
+    assert wait_until(enough)
+
+
+def wait_until(condition, seconds: float = 30.0) -> bool:
+    deadline = time.monotonic() + seconds
+    while time.monotonic() < deadline:
+        if condition():
+            return True
+        time.sleep(0.1)
+    return False
+
+
+def descendants(pid: int) -> list[int]:
+    import psutil
+
+    return [child.pid for child in psutil.Process(pid).children(recursive=True)]

@@ -1,0 +1,67 @@
+"""Studies whose runs are made of a formula: real processes, real storage, no training.
+
+As a script, it runs one study and prints why it ended: ``python -m tests.unit.hyperopt.toy FOLDER
+MAX_TRIALS WORKERS``.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from pathlib import Path
+from typing import Any
+
+from scilab_rl.hyperopt.ledger import Ledger
+from scilab_rl.hyperopt.pool import Pool
+from scilab_rl.hyperopt.settings import read_settings
+from scilab_rl.hyperopt.space import Parameter, SearchSpace
+from scilab_rl.hyperopt.study import RunPlan, Study
+
+from . import toy_worker
+from .toy_worker import EPOCH_STEPS, N_EPOCHS
+
+SPACE = SearchSpace([Parameter("++x", "float", 0.0, 1.0)])
+CHOICES = SearchSpace([Parameter("++x", "categorical", choices=(0.0, 0.25, 0.5, 0.75, 1.0))])
+
+
+def run(
+    directory: Path,
+    *overrides: str,
+    space: SearchSpace = SPACE,
+    n_workers: int = 2,
+    **sweeper: Any,
+) -> Study:
+    """Run a toy study to its end."""
+    given = {"max_trials": 12, "min_trials_per_param": 2, "n_final_runs": 1, "seed": 5} | sweeper
+    settings = read_settings(given)
+    ledger = Ledger(directory, directions=settings.directions)
+    plan = RunPlan(overrides, "eval/success_rate", N_EPOCHS, N_EPOCHS * EPOCH_STEPS, 0.9, seed=5)
+    with ledger.locked():
+        ledger.define(definition(space, settings))
+    with Pool(n_workers, directory / "workers", main=toy_worker.main) as pool:
+        study = Study(ledger, pool, space, settings, plan)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda number, _: study.interrupt(number))
+        try:
+            study.work()
+        finally:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+            signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    return study
+
+
+def definition(space: SearchSpace, settings: Any) -> dict[str, Any]:
+    """Return what `sweep` would store about a study."""
+    return {
+        "seed": 5, "overrides": ["algorithm=toy"], "space": space.describe(),
+        "score": list(settings.score), "directions": list(settings.directions),
+        "min_runs": settings.min_trials_per_param, "max_runs": settings.max_trials_per_param,
+        "env": "Toy-v0", "algorithm": "toy", "criterion": "eval/success_rate",
+        "configuration": {},
+    }  # fmt: skip
+
+
+if __name__ == "__main__":
+    folder, trials, workers = sys.argv[1:]
+    done = run(Path(folder), "seconds=0.2", max_trials=int(trials), n_workers=int(workers))
+    sys.stdout.write(f"{done.stop.reason or 'finished'}\n")

@@ -1,0 +1,70 @@
+"""A worker without torch: it follows the protocol of `worker.main` and computes its evaluations."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import random
+import signal
+import time
+from pathlib import Path
+from typing import Any
+
+from scilab_rl.hyperopt.worker import Message, Task, _die_with_parent
+
+N_EPOCHS, EPOCH_STEPS = 4, 100
+
+
+def main(connection: Any, log_path: str, n_threads: int) -> None:
+    """Follow the protocol of `worker.main`, with faults where the overrides ask for them."""
+    _die_with_parent()
+    os.setsid()
+    connection.send(Message("ready"))
+    try:
+        while (task := connection.recv()) is not None:
+            connection.send(_answer(task, connection))
+    except (EOFError, OSError):
+        return
+
+
+def _answer(task: Task, connection: Any) -> Message:
+    given = {k.lstrip("+"): v for k, _, v in (o.partition("=") for o in task.overrides)}
+    x, rng = float(given["x"]), random.Random(int(given["seed"]))
+    connection.send(Message("started", {"run_dir": f"runs/{given['x']}"}))
+    _break(given, connection)
+    if "error" in given:
+        return Message("failed", {"error": given["error"], "machine": False})
+    if "nan" in given:
+        return Message("finished", _result([float("nan")] * N_EPOCHS, "finished"))
+    values: list[float] = []
+    for epoch in range(1, N_EPOCHS + 1):
+        time.sleep(float(given.get("seconds", "0")) / N_EPOCHS)
+        values.append((1 - (x - 0.7) ** 2) * epoch / N_EPOCHS + rng.gauss(0, 0.05))
+        content = {"epoch": epoch, "step": epoch * EPOCH_STEPS, "value": values[-1]}
+        connection.send(Message("evaluated", content))
+        if not connection.recv():
+            return Message("finished", _result(values, "pruned"))
+    return Message("finished", _result(values, "finished"))
+
+
+def _break(given: dict[str, str], connection: Any) -> None:
+    """Die as asked: always, or only when nobody has done so before (``once=FILE``)."""
+    if "die" not in given or float(given["x"]) != float(given.get("where", given["x"])):
+        return
+    if "once" in given:
+        try:
+            Path(given["once"]).touch(exist_ok=False)
+        except FileExistsError:
+            return
+    if given["die"] == "segfault":
+        ctypes.string_at(0)
+    if given["die"] == "hang":
+        time.sleep(60)
+    if given["die"] == "exit":
+        os._exit(3)
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def _result(values: list[float], status: str) -> dict[str, Any]:
+    steps = [EPOCH_STEPS * (i + 1) for i in range(len(values))]
+    return {"status": status, "run_dir": "", "seconds": 0.1, "steps": steps, "values": values}
