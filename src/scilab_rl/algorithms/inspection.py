@@ -23,7 +23,7 @@ from scilab_rl.algorithms.compatibility import is_goal_space
 
 Q_VALUES, VALUE, LOG_PROB, ENTROPY = "q_values", "value", "log_prob", "entropy"
 INTRINSIC_REWARD, GOALS = "intrinsic_reward", "goals"
-N_ENTROPY_SAMPLES = 256
+N_ENTROPY_SAMPLES = 128
 _RECORD_CALL = re.compile(r"""\.record(?:_mean|_lazy)?\(\s*f?["']([^"'\n]+)["']""")
 
 Batch = Any  # observations of a vector environment: an array, or a dictionary of arrays
@@ -78,7 +78,7 @@ class Inspection:
     def entropy(self, observation: Any) -> float:
         """Return the entropy of the policy in nats.
 
-        Where there is no closed form it is the mean of -log pi(a|s) over 256 samples, always from
+        Where there is no closed form it is the mean of -log pi(a|s) over 128 samples, always from
         the same random numbers, so that the curve over an episode is smooth.
         """
         if ENTROPY in self._ask:
