@@ -69,6 +69,7 @@ KEYS = (
     Key("wrappers", LIST, "wrappers around the environment, each with a _target_"),
     Key("n_envs", WHOLE, "training environments side by side", low=1),
     Key("vector", TEXT, "where they run", choices=("inprocess", "subprocess")),
+    Key("fast_fetch", SWITCH, "make Fetch's steps faster; its observations stay the same"),
     Key(
         "tuned", SWITCH, "use the tuned values for this algorithm and environment, if there are any"
     ),

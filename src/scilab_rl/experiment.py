@@ -274,6 +274,7 @@ def env_settings(cfg: DictConfig) -> Any:
         wrappers=[_partial(wrapper, "wrappers") for wrapper in cfg.wrappers],
         n_envs=cfg.n_envs,
         vector=cfg.vector,
+        fast_fetch=cfg.fast_fetch,
         seed=cfg.seed,
         modules=[DESK_ENVS] if DESK_ENVS in sys.modules else [],
     )
