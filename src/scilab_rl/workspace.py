@@ -11,6 +11,7 @@ from scilab_rl.errors import ConfigError
 
 SHIPPED_CONF = Path(__file__).parent / "conf"
 DESK_CONF = Path("conf")
+DESK_ALGORITHMS = Path("src/custom_algorithms")
 DESK_ENVS = "custom_envs"
 
 

@@ -28,8 +28,6 @@ _ACTION_SPACES: dict[str, tuple[type[spaces.Space], ...]] = {
     "A2C": _ANY,
     "TRPO": _ANY,
 }
-# CrossQ's policies exist for plain vectors only (no MultiInputPolicy).
-_NO_DICT_OBSERVATIONS = ("CrossQ",)
 
 
 def supported_action_spaces(cls: type) -> tuple[type[spaces.Space], ...] | None:
@@ -46,7 +44,8 @@ def supported_action_spaces(cls: type) -> tuple[type[spaces.Space], ...] | None:
 
 def reads_dictionaries(cls: type) -> bool:
     """Tell whether an algorithm class has a policy for Dict observations, and so for goals."""
-    return not any(ancestor.__name__ in _NO_DICT_OBSERVATIONS for ancestor in cls.__mro__)
+    # CrossQ of sb3-contrib has none. One-file algorithms have no list of policies and read all.
+    return "MultiInputPolicy" in getattr(cls, "policy_aliases", ("MultiInputPolicy",))
 
 
 def is_goal_space(space: spaces.Space) -> bool:

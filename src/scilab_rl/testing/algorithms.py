@@ -38,6 +38,7 @@ from scilab_rl.metrics.logger import MetricLogger, as_number
 from scilab_rl.training import checkpoint
 from scilab_rl.training.snapshot import capture, random_state, restore, set_random_state
 from scilab_rl.training.trainer import load_policy, policy_state
+from scilab_rl.workspace import open_desk
 
 # In the order of preference: the first one whose spaces the algorithm takes.
 _WITHOUT_GOALS = ("scilab_rl.testing:TinyBox-v0", "scilab_rl.testing:TinyDiscrete-v0")
@@ -335,6 +336,7 @@ def _composed_run() -> DictConfig:
 
 @functools.cache
 def _composed(algorithm: str) -> dict[str, Any]:
+    open_desk()
     with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
         cfg = config.compose([f"algorithm={algorithm}", "tuned=false"])
     return OmegaConf.to_container(cfg.algorithm, resolve=True)  # type: ignore[return-value]
