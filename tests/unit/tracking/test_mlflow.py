@@ -140,7 +140,7 @@ def test_two_processes_create_the_database_at_once_offline_and_nothing_else(tmp_
     base.mkdir()
     processes = [in_a_process(ONE_RUN, base, name) for name in ("a", "b")]
     for process in processes:
-        output, errors = process.communicate(timeout=120)
+        output, errors = process.communicate(timeout=300)
         assert process.returncode == 0, errors
         assert output.strip() == "connected []"
     assert {path.name for path in base.iterdir()} == {"mlflow.db", ".mlflow.lock", "2026-01-02"}

@@ -44,7 +44,7 @@ def run_offline(tmp_path, in_a_process, **options):
     base = tmp_path / "data"
     base.mkdir()
     process = in_a_process(ONE_RUN, base, **options)
-    output, errors = process.communicate(timeout=120)
+    output, errors = process.communicate(timeout=300)
     assert process.returncode == 0, errors
     assert list(in_a_process.home.iterdir()) == list(in_a_process.folder.iterdir()) == []
     return base, output, errors
