@@ -29,6 +29,7 @@ _FLAGS = (
     ("--multirun, -m", "run all combinations of the values that are separated by commas"),
     ("--cfg job", "show the configuration and do not run"),
     ("--debug", "show the full traceback of an error"),
+    ("--trust-pickle", "load a policy from a zip of Stable-Baselines3, which can run any code"),
     ("--version", "show the version"),
     ("--help, -h", "show this; `scilab-rl COMMAND --help` shows the options of a command"),
 )
