@@ -9,9 +9,10 @@ answer with one row per entry. Otherwise the networks of Stable-Baselines3's pol
 
 from __future__ import annotations
 
+import ast
 import contextlib
 import inspect
-import re
+import textwrap
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -24,7 +25,7 @@ from scilab_rl.algorithms.compatibility import is_goal_space
 Q_VALUES, VALUE, LOG_PROB, ENTROPY = "q_values", "value", "log_prob", "entropy"
 INTRINSIC_REWARD, GOALS = "intrinsic_reward", "goals"
 N_ENTROPY_SAMPLES = 128
-_RECORD_CALL = re.compile(r"""\.record(?:_mean|_lazy)?\(\s*f?["']([^"'\n]+)["']""")
+_RECORDING = ("record", "record_mean", "record_lazy")
 
 Batch = Any  # observations of a vector environment: an array, or a dictionary of arrays
 
@@ -158,8 +159,26 @@ def recorded_names(algorithm: Any) -> set[str]:
             source = inspect.getsource(ancestor)
         except (OSError, TypeError):  # built-in classes have no source
             continue
-        names |= {re.sub(r"\{[^}]*\}", "*", name) for name in _RECORD_CALL.findall(source)}
+        calls = ast.walk(ast.parse(textwrap.dedent(source)))
+        names |= {_recorded_name(node) for node in calls if _is_record_call(node)}
     return {name for name in names if not name.startswith("*")}
+
+
+def _is_record_call(node: ast.AST) -> bool:
+    return (
+        isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Attribute)
+        and node.func.attr in _RECORDING
+        and bool(node.args)
+    )
+
+
+def _recorded_name(node: Any) -> str:
+    """Return the name in a call of ``record``, with a star for what is put in while it runs."""
+    name = node.args[0]
+    parts = name.values if isinstance(name, ast.JoinedStr) else [name]
+    texts = [part.value if isinstance(part, ast.Constant) else "*" for part in parts]
+    return "".join(map(str, texts))
 
 
 def _methods(algorithm: Any) -> dict[str, Callable[..., Any]]:

@@ -57,6 +57,8 @@ class ClipRecorder:
             self._finished.put(None)
             self._thread.join()
             self._thread = None
+            n, run = len(self.recordings), self.folder.parent
+            _log.info("Recorded episodes: %d. Look at them with: scilab-rl view %s", n, run)
 
     def _work(self) -> None:
         while (clip := self._finished.get()) is not None:

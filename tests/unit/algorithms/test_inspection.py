@@ -155,6 +155,8 @@ def test_normalised_observations_and_rewards_are_what_the_critics_learn() -> Non
 def test_recorded_names_are_read_from_the_source() -> None:
     names = recorded_names(CLEANSAC(env=make_env(), net_arch=[8]))
     assert {"train/critic_variance", "train/ent_coef", "train/rollout_q_step"} <= names
+    # An example in a docstring records nothing.
+    assert "train/critic_loss" not in recorded_names(RANDOM(env=make_env()))
     assert {"train/critic_loss", "train/ent_coef"} <= recorded_names(
         stable_baselines3.SAC("MlpPolicy", make_env(), **small())
     )
