@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import queue
 import threading
@@ -46,14 +47,15 @@ class ClipRecorder:
         if clip is None or not any(record.action is not None for record in clip.records):
             return
         if self._thread is None:
-            # No daemon: a program that ends waits for its last clip.
-            self._thread = threading.Thread(target=self._work, name="recorder")
+            self._thread = threading.Thread(target=self._work, name="recorder", daemon=True)
             self._thread.start()
+            atexit.register(self.close)  # a program that ends waits for its last clip
         self._finished.put(clip)
 
     def close(self) -> None:
         """Wait until all clips are written."""
         if self._thread is not None:
+            atexit.unregister(self.close)
             self._finished.put(None)
             self._thread.join()
             self._thread = None
