@@ -22,6 +22,7 @@ COMMANDS = {
     "resume": "continue an interrupted run",
     "new": "create an algorithm of your own from an existing one",
     "runs": "list the recorded runs",
+    "study": "show what a hyperparameter study has found",
     "algorithms": "list the algorithms",
     "envs": "list the environments",
     "explain": "show where the value of a key comes from",
@@ -62,7 +63,7 @@ def run_command_line(arguments: list[str]) -> int:
     except BrokenPipeError:  # the reader of our output has gone, as in `scilab-rl runs | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return EXIT_PIPE_CLOSED
-    except Exception as error:  # noqa: BLE001 - a newcomer gets one line here too
+    except Exception as error:
         if debug:
             raise
         message = " ".join(str(error).split())
@@ -110,6 +111,7 @@ def train(arguments: list[str]) -> int:
     from hydra.core.hydra_config import HydraConfig
 
     from scilab_rl.config import compose, explain_error, friendly_override
+    from scilab_rl.hyperopt.folders import expand_best_of
     from scilab_rl.workspace import open_desk
 
     results: list[Any] = []
@@ -128,8 +130,9 @@ def train(arguments: list[str]) -> int:
         return results[-1].score
 
     open_desk()
+    arguments = expand_best_of(arguments)
     # Hydra takes overrides before its flags only.
-    arguments = sorted(arguments, key=lambda argument: argument in ("--multirun", "-m"))
+    arguments.sort(key=lambda argument: argument in ("--multirun", "-m"))
     original, sys.argv = sys.argv, [sys.argv[0], *map(friendly_override, arguments)]
     try:
         task()

@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import IO, Any
 
 import optuna
+import yaml
 from optuna.trial import FrozenTrial, TrialState
 
 from scilab_rl.errors import ScilabRLError
 from scilab_rl.files import write_text
+from scilab_rl.hyperopt.folders import DATABASE, DEFINITION_FILE, STOP_FILE
 from scilab_rl.hyperopt.runs import LOST, RUNNING, Run
 
-STUDIES, DATABASE, STOP_FILE = "studies", "study.db", "delete_me_to_stop"
 _RUN_KEY, _DEFINITION = "run/", "definition"
 _LOCK_SECONDS = 60
 
@@ -133,6 +134,12 @@ class Ledger:
             return True
         self._lease_path(owner).unlink(missing_ok=True)
         return False
+
+
+def open_ledger(directory: Path) -> Ledger:
+    """Open the memory of an existing study."""
+    stored = yaml.safe_load((directory / DEFINITION_FILE).read_text(encoding="utf-8"))
+    return Ledger(directory, stored["sweeper"]["storage"])
 
 
 def _open_storage(url: str) -> optuna.storages.RDBStorage:

@@ -37,7 +37,8 @@ def render(summary: Summary, figures: Mapping[str, Path]) -> str:
         "<h2>All settings</h2>",
         _settings(summary),
         _failures(summary),
-        f"<h2>Repeat it</h2><p><code>{_escape(_command(summary))}</code></p>",
+        "<h2>Train with the winner</h2>",
+        f"<p><code>python src/main.py +best_of={_escape(summary.name)}</code></p>",
     ]
     title = _escape(summary.name)
     return (
@@ -77,12 +78,6 @@ def _failures(summary: Summary) -> str:
     if not rows:
         return ""
     return "<h2>Failed runs</h2>" + _table(("", "setting", "error", "folder"), rows)
-
-
-def _command(summary: Summary) -> str:
-    return "python src/main.py " + " ".join(
-        [*summary.definition["overrides"], f"+best_of={summary.name}"]
-    )
 
 
 def _table(columns: Iterable[str], rows: Iterable[Iterable[str]], *, heading: bool = True) -> str:

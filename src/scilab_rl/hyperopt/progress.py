@@ -14,7 +14,7 @@ from rich.live import Live
 from rich.text import Text
 
 from scilab_rl.hyperopt import race
-from scilab_rl.hyperopt.ledger import STOP_FILE
+from scilab_rl.hyperopt.folders import STOP_FILE
 from scilab_rl.hyperopt.runs import COMPLETE, FAILED, LOST, PRUNED, RUNNING, Run, entries_of
 from scilab_rl.hyperopt.settings import StudySettings
 from scilab_rl.hyperopt.summary import with_interval

@@ -10,12 +10,12 @@ from typing import Any
 
 import yaml
 
-from scilab_rl.files import write_text
+from scilab_rl.files import write_json, write_text
+from scilab_rl.hyperopt.folders import REPORT, TABLE, TUNED_FILE, WINNER_FILE
 from scilab_rl.hyperopt.ledger import Ledger
+from scilab_rl.hyperopt.space import override_text
 from scilab_rl.hyperopt.summary import Summary, summarize
 from scilab_rl.tracking.console import print_table
-
-REPORT, WINNER_FILE, TABLE = "report.html", "winner.yaml", "settings.csv"
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,8 @@ def write_report(ledger: Ledger) -> Report:
     directory = ledger.directory
     write_text(directory / TABLE, summary.table())
     if summary.winner is not None:
-        write_text(directory / WINNER_FILE, tuned_values(summary))
+        write_text(directory / TUNED_FILE, tuned_values(summary))
+        write_json(directory / WINNER_FILE, {"overrides": winner_overrides(summary)})
     figures = plots.draw_all(summary, directory / "plots")
     write_text(directory / REPORT, page.render(summary, figures))
     return Report(summary, directory)
@@ -61,6 +62,16 @@ def tuned_values(summary: Summary) -> str:
         f"# @package _global_\n# Found by the study {summary.name}.\n{facts}"
         f"{yaml.safe_dump(values, sort_keys=False)}"
     )
+
+
+def winner_overrides(summary: Summary) -> list[str]:
+    """Return the overrides that train with the winner."""
+    keys = {name: entry["key"] for name, entry in summary.definition["space"].items()}
+    values = typed_setting(summary).items()
+    return [
+        *summary.definition["overrides"],
+        *(f"{keys[name]}={override_text(value)}" for name, value in values),
+    ]
 
 
 def typed_setting(summary: Summary) -> Mapping[str, Any]:

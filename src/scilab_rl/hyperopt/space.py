@@ -94,7 +94,8 @@ class Parameter:
 
     def describe(self) -> dict[str, Any]:
         """Return what can be written as JSON and compared."""
-        described = {k: v for k, v in asdict(self).items() if v not in (None, False, (), {})}
+        empty = ("None", "False", "()", "{}")  # but not 0, which is a bound
+        described = {k: v for k, v in asdict(self).items() if repr(v) not in empty}
         return described | ({"choices": list(self.labels)} if self.choices else {})
 
 

@@ -19,6 +19,7 @@ from scilab_rl.hyperopt.runs import COMPLETE, FAILED, PRUNED, RUNNING, Run, entr
 from scilab_rl.hyperopt.source import settings_of
 from scilab_rl.hyperopt.space import Setting
 
+_FEWEST_FOR_IMPORTANCE = 8
 WINNER, CONTENDER, BEATEN = "winner", "may still be best", "beaten"
 
 
@@ -187,10 +188,12 @@ def importance_of(
                     value=means[trial.number],
                 )
             )
+    if len(study.trials) < _FEWEST_FOR_IMPORTANCE:
+        return {}
     try:
         evaluator = optuna.importance.PedAnovaImportanceEvaluator()
         return optuna.importance.get_param_importances(study, evaluator=evaluator)
-    except (ValueError, RuntimeError):  # too few settings, or nothing that differs
+    except (ValueError, RuntimeError):  # no two settings differ
         return {}
 
 

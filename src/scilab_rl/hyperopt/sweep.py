@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from omegaconf import DictConfig, OmegaConf
 from scilab_rl import config, experiment
 from scilab_rl.errors import ConfigError, ScilabRLError, SomeRunsFailedError
 from scilab_rl.files import write_text
-from scilab_rl.hyperopt.ledger import STUDIES, Ledger
+from scilab_rl.hyperopt.folders import DEFINITION_FILE, STUDIES
+from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.pool import Pool, n_cores
 from scilab_rl.hyperopt.report import write_report
 from scilab_rl.hyperopt.samplers import require_packages
@@ -28,6 +30,7 @@ from scilab_rl.hyperopt.space import (
     parse_space,
 )
 from scilab_rl.hyperopt.study import RunPlan, Study
+from scilab_rl.results import slug
 from scilab_rl.seeding import resolve_seed
 
 if TYPE_CHECKING:
@@ -93,10 +96,12 @@ def run_study(sweeper: Mapping[str, Any], overrides: Sequence[Override]) -> None
         StudyInterrupted: If a signal has stopped it; the report is there.
     """
     request = read_request(sweeper, overrides)
-    settings = read_settings(request.sweeper)
-    require_packages(settings.sampler)
     space = SearchSpace(request.parameters)
     cfg = check_runs(request, space)
+    family = re.sub(r"^.*:|-v\d+$", "", cfg.env)
+    name = request.sweeper.get("study_name") or slug(f"{cfg.algorithm.name}_{family}")
+    settings = read_settings({**request.sweeper, "study_name": name})
+    require_packages(settings.sampler)
     n_settings = settings.max_trials // settings.min_trials_per_param
     if n_settings < 2:
         _log.info(
@@ -128,8 +133,7 @@ def run_study(sweeper: Mapping[str, Any], overrides: Sequence[Override]) -> None
         study = Study(ledger, pool, space, settings, plan, progress)
         with _signals_to(study):
             study.work()
-    report = write_report(ledger)
-    report.print_summary()
+    write_report(ledger).print_summary()
     _conclude(study)
 
 
@@ -268,7 +272,7 @@ def _save_configuration(directory: Path, cfg: DictConfig, settings: StudySetting
     import dataclasses
 
     stored = {"sweeper": dataclasses.asdict(settings), "run": OmegaConf.to_container(cfg)}
-    write_text(directory / "study.yaml", OmegaConf.to_yaml(OmegaConf.create(stored)))
+    write_text(directory / DEFINITION_FILE, OmegaConf.to_yaml(OmegaConf.create(stored)))
 
 
 @contextlib.contextmanager

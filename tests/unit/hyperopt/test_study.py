@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 from optuna.trial import TrialState
 
-from scilab_rl.hyperopt.ledger import DATABASE, STOP_FILE, Ledger
+from scilab_rl.hyperopt.folders import DATABASE, STOP_FILE
+from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.runs import COMPLETE, FAILED, LOST, PRUNED, RUNNING
 from scilab_rl.hyperopt.source import settings_of
 

@@ -1,0 +1,144 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
+from omegaconf import OmegaConf
+
+from scilab_rl.errors import ConfigError
+from scilab_rl.hyperopt.folders import expand_best_of
+from scilab_rl.hyperopt.pool import n_cores
+from scilab_rl.hyperopt.samplers import SAMPLERS, make_sampler
+from scilab_rl.hyperopt.settings import StudySettings, read_settings
+from scilab_rl.hyperopt.sweep import is_study, n_workers, read_request, refuse_changes
+from scilab_rl.workspace import SHIPPED_CONF
+
+
+def parsed(*overrides: str) -> list:
+    return OverridesParser.create().parse_overrides(list(overrides))
+
+
+def test_shipped_file_has_exactly_the_keys_and_only_defaults() -> None:
+    shipped = OmegaConf.to_container(OmegaConf.load(SHIPPED_CONF / "hydra/sweeper/study.yaml"))
+    assert {shipped.pop("_target_"), shipped.pop("params")} == {
+        "hydra_plugins.scilab_rl.sweeper.StudySweeper", None,
+    }  # fmt: skip
+    assert read_settings(shipped) == StudySettings()
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"max_trails": 3}, "Did you mean 'max_trials'"),
+        ({"max_trials": 0}, "whole number from 1"),
+        ({"max_trials": 2.5}, "whole number from 1"),
+        ({"n_jobs": "abc"}, "whole number from 1"),
+        ({"n_jobs": True}, "whole number from 1"),
+        ({"min_trials_per_param": 4, "max_trials_per_param": 3}, "must not be above"),
+        ({"direction": "maximise"}, "Did you mean 'maximize'"),
+        ({"sampler": "tpee"}, "Did you mean 'tpe'"),
+        ({"pruner": "medain"}, "Did you mean 'median'"),
+        ({"score": "fnal"}, "Did you mean 'final'"),
+        ({"score": ["final", "auc"], "direction": "maximize"}, "2 scores and 1 directions"),
+        ({"score": "steps_to_threshold", "direction": "maximize"}, "less is better"),
+        ({"study_name": "../evil"}, "becomes a folder"),
+        ({"study_name": "a/b"}, "becomes a folder"),
+        ({"study_name": "-x"}, "becomes a folder"),
+        ({"study_name": "x" * 300}, "becomes a folder"),
+        ({"study_name": "a\nb"}, "becomes a folder"),
+        ({"max_duration_minutes": -1}, "above 0"),
+        ({"trial_timeout": float("nan")}, "above 0"),
+    ],
+)
+def test_wrong_values_are_named(given: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read_settings(given)
+
+
+def test_few_trials_lower_the_repeats() -> None:
+    settings = read_settings({"max_trials": 2})
+    assert (settings.min_trials_per_param, settings.n_final_runs) == (2, 2)
+    assert read_settings({"min_trials_per_param": 20}).max_trials_per_param == 20
+
+
+def test_what_is_a_study_and_what_a_grid() -> None:
+    assert not is_study({}, parsed("algorithm=sac,td3", "seed=1,2"))
+    assert is_study({}, parsed("algorithm.gamma=interval(0.9,0.99)"))
+    assert is_study({"study_name": "x"}, parsed("algorithm=sac,td3"))
+    assert is_study({"search_space": {"++a": {}}}, parsed("algorithm=sac"))
+
+
+def test_command_line_wins_over_the_file() -> None:
+    space = {"++algorithm.gamma": {"type": "float", "low": 0.5, "high": 0.9}}
+    overrides = parsed("env=X", "++algorithm.gamma=interval(0.9,0.99)", "hydra.sweeper.seed=3")
+    request = read_request({"search_space": space}, overrides)
+    assert [(p.low, p.high) for p in request.parameters] == [(0.9, 0.99)]
+    assert request.fixed == ("env=X",)
+
+
+def test_seeds_are_the_study_s_own() -> None:
+    with pytest.raises(ConfigError, match="leave seed out"):
+        read_request({"study_name": "x"}, parsed("seed=1,2"))
+    with pytest.raises(ConfigError, match="nothing to search"):
+        read_request({"study_name": "x"}, parsed("env=X"))
+
+
+def test_workers_are_never_more_than_cores(caplog: pytest.LogCaptureFixture) -> None:
+    assert n_workers(None) == n_cores()
+    assert n_workers(1) == 1
+    assert n_workers(n_cores() + 14) == n_cores()
+
+
+@pytest.mark.parametrize("name", [name for name in SAMPLERS if name != "grid"])
+def test_samplers_draw_the_same_from_the_same_seed(name: str) -> None:
+    import optuna
+
+    for package in SAMPLERS[name]:
+        pytest.importorskip(package)
+
+    def draw(seed: int) -> list[float]:
+        study = optuna.create_study()
+        for i in range(4):
+            study.sampler = make_sampler(name, 5, seed + i)
+            trial = study.ask()
+            study.tell(trial, trial.suggest_float("x", 0, 1) + trial.suggest_float("y", 0, 1))
+        return [value for trial in study.trials for value in trial.params.values()]
+
+    assert draw(1) == draw(1)
+
+
+OLD = {
+    "configuration": {"n_epochs": "60", "env": "X"}, "score": ["default"],
+    "directions": ["maximize"], "min_runs": 3, "space": {"a": {"low": 0.0, "high": 1.0}},
+}  # fmt: skip
+
+
+def test_a_study_keeps_its_budget_and_its_space() -> None:
+    refuse_changes(OLD, OLD, StudySettings())
+    shorter = OLD | {"configuration": {"n_epochs": "2", "env": "X"}}
+    with pytest.raises(ConfigError, match=r"n_epochs: 60 \(now 2\).*another study_name"):
+        refuse_changes(OLD, shorter, StudySettings(allow_space_change=True))
+    wider = OLD | {"space": {"a": {"low": 0.0, "high": 2.0}}}
+    with pytest.raises(ConfigError, match=r"'high': 1.0.*'high': 2.0.*allow_space_change"):
+        refuse_changes(OLD, wider, StudySettings())
+    refuse_changes(OLD, wider, StudySettings(allow_space_change=True))
+
+
+def test_best_of_needs_a_study_with_a_winner(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = tmp_path / "data" / "studies" / "mine"
+    folder.mkdir(parents=True)
+    assert expand_best_of(["env=X"]) == ["env=X"]
+    with pytest.raises(ConfigError, match="no study 'mine'"):
+        expand_best_of(["+best_of=mine"])
+    (folder / "study.yaml").write_text("{}")
+    with pytest.raises(ConfigError, match="no winner yet"):
+        expand_best_of(["+best_of=mine"])
+    (folder / "winner.json").write_text('{"overrides": ["env=X", "n_epochs=9", "++a.b=0.5"]}')
+    expected = ["env=X", "++a.b=0.5", "n_epochs=3"]
+    assert expand_best_of(["+best_of=mine", "n_epochs=3"]) == expected
+    assert expand_best_of(["--best-of", "mine", "n_epochs=3"]) == expected
+    (folder / "winner.json").write_text('{"overrides": ["algorithm._target_=os.system"]}')
+    with pytest.raises(ConfigError, match="no value"):
+        expand_best_of(["+best_of=mine"])
