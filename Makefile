@@ -7,7 +7,7 @@ EXTRAS := dev,mlflow,wandb,tensorboard,view
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check format test test-slow demo mlflow clean-venv
+.PHONY: help setup check format test test-slow demo figure-fetchpush mlflow clean-venv
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -41,6 +41,12 @@ test: $(VENV)/.installed  ## the fast tests
 
 test-slow: $(VENV)/.installed  ## the slow and the performance tests (an hour)
 	$(BIN)/python -m pytest -m "slow or performance"
+
+figure-fetchpush: setup  ## the paper's figure: critic variance while the block falls (about 10 minutes)
+	$(BIN)/python src/main.py algorithm=sac_var env=FetchPush-v1 seed=1 n_epochs=6 n_test_rollouts=5 \
+	  algorithm.n_critics=4 algorithm.weight_critic_var=0.25 algorithm.learning_rate=1e-3 \
+	  algorithm.gamma=0.95 algorithm.tau=0.05 algorithm.learning_starts=1000
+	$(BIN)/python scripts/figure_fetchpush.py last --falls 24
 
 mlflow: $(VENV)/.installed  ## browse the recorded runs on http://127.0.0.1:5000
 	$(BIN)/mlflow ui --host 127.0.0.1 --port 5000 --backend-store-uri sqlite:///data/mlflow.db
