@@ -105,6 +105,9 @@ def _register(package: str) -> None:
     _drop_import_notice(package)
     module = importlib.import_module(package)
     gym.register_envs(module)
+    own_part = f"scilab_rl.envs.suites.{package}"
+    if importlib.util.find_spec(own_part):
+        importlib.import_module(own_part).register()
 
 
 def _drop_import_notice(package: str) -> None:

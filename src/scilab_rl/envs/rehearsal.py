@@ -104,8 +104,8 @@ def success_at(env: gym.Env, observation: Any, info: dict[str, Any]) -> bool | N
         info: Of a reset; many environments say nothing there.
     """
     success = success_of(info)
-    reward = getattr(env.unwrapped, "compute_reward", None)
-    if success is not None or reward is None or not isinstance(observation, dict):
+    if success is not None or not env.has_wrapper_attr("compute_reward"):
         return success
+    reward = env.get_wrapper_attr("compute_reward")
     achieved, desired = observation["achieved_goal"], observation["desired_goal"]
     return bool(reward(achieved, desired, info) >= reward(achieved, achieved, info))

@@ -1,0 +1,47 @@
+"""The parking task of highway-env with episodes of 100 steps."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from highway_env.envs.parking_env import ParkingEnv
+
+
+class Parking(ParkingEnv):
+    """highway-env's parking, whose reward and ending can be computed for relabelled goals too.
+
+    The original adds the cost of a collision in `step` alone, and has no ``compute_terminated``.
+    """
+
+    def compute_reward(
+        self, achieved_goal: Any, desired_goal: Any, info: Any, p: float = 0.5
+    ) -> Any:
+        """Return the proximity to the goal, minus the cost of a crash that the info tells of.
+
+        Shapes:
+            achieved_goal, desired_goal: ``(..., 6)``; info: one dictionary or ``(n,)`` of them.
+        """
+        difference = np.abs(np.asarray(achieved_goal) - np.asarray(desired_goal))
+        cost = np.power(difference @ np.asarray(self.config["reward_weights"]), p)
+        return self.config["collision_reward"] * _crashed(info) - cost
+
+    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """Return whether the car is parked or has crashed. Shapes: as `compute_reward`."""
+        proximity = ParkingEnv.compute_reward(self, achieved_goal, desired_goal, {})
+        return (proximity > -self.config["success_goal_reward"]) | (_crashed(info) > 0)
+
+
+def register() -> None:
+    """Register ``parking-limited-v0``."""
+    if "parking-limited-v0" not in gym.registry:
+        entry_point = f"{__name__}:Parking"
+        gym.register("parking-limited-v0", entry_point=entry_point, max_episode_steps=100)
+
+
+def _crashed(info: Any) -> Any:
+    """Return 1 where the car has crashed. Shapes: ``()`` or ``(n,)``."""
+    if isinstance(info, dict):
+        return float(info.get("crashed", False))
+    return np.array([float(entry.get("crashed", False)) for entry in info])

@@ -1,0 +1,35 @@
+from __future__ import annotations
+
+import gymnasium as gym
+import numpy as np
+import pytest
+
+from scilab_rl.envs import registration
+from scilab_rl.envs.registration import resolve_env_id
+from scilab_rl.errors import MissingDependencyError
+from scilab_rl.testing.goal_environments import EnvironmentContract
+
+
+def test_missing_package_names_the_extra(monkeypatch) -> None:
+    monkeypatch.setattr(registration.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.delitem(gym.registry, "parking-limited-v0", raising=False)
+    with pytest.raises(MissingDependencyError, match=r'"scilab-rl\[highway\]"'):
+        resolve_env_id("parking-limited-v0")
+
+
+class TestParking(EnvironmentContract):
+    env = "parking-limited-v0"
+    n_steps = 200
+
+    @pytest.fixture(autouse=True)
+    def _installed(self) -> None:
+        pytest.importorskip("highway_env")
+
+    def test_a_crash_costs_and_ends_in_relabelled_goals_too(self) -> None:
+        env = gym.make(resolve_env_id(self.env)[0]).unwrapped
+        goals, infos = np.zeros((2, 6)), [{"crashed": True}, {"crashed": False}]
+        desired = np.array([[0.0] * 6, [0.25, 0, 0, 0, 0, 0]])
+        assert env.compute_reward(goals, desired, infos).tolist() == [-5.0, -0.5]
+        assert env.compute_terminated(goals, desired, infos).tolist() == [True, False]
+        assert env.compute_terminated(goals[0], goals[0], {})  # parked
+        assert gym.spec(self.env).max_episode_steps == 100
