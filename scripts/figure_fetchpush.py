@@ -1,7 +1,7 @@
 """The figure of the Scilab-RL paper: does the critics' variance rise when the block falls?
 
-Takes an agent that was trained on FetchPush, pushes the block over the edge of the table by a script,
-at least 20 times, and looks at the variance of the agent's critics before, at and after the fall.
+Takes an agent that was trained on FetchPush, pushes the block over the edge of the table by a
+script, at least 20 times, and looks at the variance of the agent's critics before, at and after the fall.
 Writes a picture, a table and a Wilcoxon test, whatever they say.
 
 Run: make figure-fetchpush, or python scripts/figure_fetchpush.py RUN [--falls 20]
@@ -181,7 +181,8 @@ def _draw(falls: list[dict[str, Any]], result: dict[str, Any], path: Path) -> No
         axes[3].fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
     axes[3].axvline(0, color="grey", linewidth=1)
     axes[3].set_xlabel("steps from the fall")
-    axes[3].set_title(f"critic variance, median and quartiles of {result['falls']} falls", fontsize=10)
+    title = f"critic variance, median and quartiles of {result['falls']} falls"
+    axes[3].set_title(title, fontsize=10)
     axes[3].legend(frameon=False, fontsize=8)
     axes[3].spines[["top", "right"]].set_visible(False)
     figure.tight_layout()

@@ -198,7 +198,7 @@ def load_recorded(path: Path, overrides: Sequence[str] = ()) -> DictConfig:
 def _defaults() -> DictConfig:
     cfg = OmegaConf.load(SHIPPED_CONF / "main.yaml")
     assert isinstance(cfg, DictConfig)
-    return OmegaConf.masked_copy(cfg, [key for key in cfg if key not in ("defaults", "hydra")])
+    return OmegaConf.masked_copy(cfg, [str(key) for key in cfg if key not in ("defaults", "hydra")])
 
 
 def refuse_foreign_code(value: Any, path: Path) -> None:

@@ -27,7 +27,10 @@ COMMANDS = [
         "early_stop_last_n=1",
         "FetchReach-v4",
     ),
-    ("python src/main.py algorithm=sac env=Pendulum-v1 +flatten_obs=1 +clip_action=1", "Pendulum-v1"),
+    (
+        "python src/main.py algorithm=sac env=Pendulum-v1 +flatten_obs=1 +clip_action=1",
+        "Pendulum-v1",
+    ),
     (
         "python src/main.py algorithm=sac env=FetchReach-v4 +flatten_obs=1 +normalize_obs=1 "
         "+normalize_reward=1",

@@ -104,7 +104,7 @@ def test_restored_policy_acts_as_the_saved_one(finished_run: Path) -> None:
 
 @pytest.mark.parametrize("algorithm", ["sac", "cleansac", "ppo"])
 def test_killed_and_resumed_equals_uninterrupted(algorithm: str, tmp_path: Path) -> None:
-    """Killed with SIGKILL in the middle of an epoch: weights and metrics end the same, bit for bit."""
+    """Killed in the middle of an epoch: weights and metrics end the same, bit for bit."""
     arguments = [f"algorithm={algorithm}", TINY, "n_envs=2", *QUICK, "save_model_freq=60"]
     if algorithm == "ppo":
         arguments = [a for a in arguments if "buffer_size" not in a] + ["algorithm.n_steps=32"]
@@ -190,7 +190,7 @@ def test_commands_start_without_heavy_imports() -> None:
 def _start_and_signal(
     arguments: list[str], folder: Path, number: signal.Signals
 ) -> subprocess.CompletedProcess:
-    """Start a run, wait for its second epoch, and send a signal to it in the middle of the third."""
+    """Start a run, wait for its second epoch, and send a signal in the middle of the third."""
     before = set(folder.glob("data/*/*"))
     process = subprocess.Popen(
         command(*arguments),

@@ -17,6 +17,8 @@ from scilab_rl.results import CONFIG_FILE, RunDirectory, find_run
 from scilab_rl.workspace import open_desk
 
 _log = logging.getLogger(__name__)
+# The first of each row that an algorithm can answer is drawn when nothing else is asked for.
+_TELLING = (("q_values", "value"), ("critic_variance",), ("goal_distance",), ("reward",))
 _SMALL_BUFFER = 1000  # a policy that only acts needs no replay buffer
 
 
@@ -107,6 +109,16 @@ def load_player(cfg: Any, folder: Path, *, record: bool) -> tuple[Any, Any]:
     return env, model
 
 
+def telling_metrics(model: Any) -> list[str]:
+    """Return the metrics that say most about an algorithm, of those that it can answer."""
+    from scilab_rl.algorithms.inspection import Inspection
+    from scilab_rl.metrics.probes import answerable
+
+    possible = answerable(Inspection(model))
+    chosen = (next((name for name in row if name in possible), None) for row in _TELLING)
+    return [name for name in chosen if name is not None]
+
+
 def film_first_episode(model: Any, env: Any, cfg: Any, run: RunDirectory, metrics: str) -> Any:
     """Prepare the recording of the next episode; the result returns its video when called."""
     from scilab_rl.training import showing
@@ -118,7 +130,7 @@ def film_first_episode(model: Any, env: Any, cfg: Any, run: RunDirectory, metric
     folder = run / FOLDER
     number = len(list(folder.glob(f"play_*{SUFFIX}"))) + 1
     clip = ClipInfo(f"play_{number:03d}", "eval", 0, cfg.env, cfg.algorithm.name, 0.0, ())
-    names = metrics.split(",") if metrics else list(cfg.render_metrics_test)
+    names = metrics.split(",") if metrics else telling_metrics(model)
     timeline, recorder = showing.film_first_episode(env, model, names, clip, folder)
 
     def finish() -> Path:

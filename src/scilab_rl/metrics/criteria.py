@@ -28,7 +28,7 @@ def should_stop_early(series: Sequence[float], threshold: float, last_n: int) ->
 
 
 def final_score(store: MetricStore, criterion: str) -> float | None:
-    """Return the last value of the criterion, or None when it was never measured or is no number."""
+    """Return the last value of the criterion; None when it was never measured or is no number."""
     value = store.latest(criterion)
     return value if value is not None and math.isfinite(value) else None
 

@@ -161,7 +161,7 @@ def log_prob(mind: Inspectable, observation: Any, action: Any) -> float:
 
 def reward(mind: Inspectable, observation: Any, action: Any, reward: float) -> float:
     """What the environment gave for this action."""
-    return reward
+    return reward + 0.0  # never -0
 
 
 class ReturnSoFar:

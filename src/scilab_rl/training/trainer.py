@@ -161,7 +161,7 @@ class Trainer(BaseCallback):
         values = self._training_metrics(training_seconds)
         values |= self._evaluate()
         self._refuse_nan(values)
-        # What is not defined in an epoch, such as the explained variance of equal returns, is a gap.
+        # What is not defined in an epoch (the explained variance of equal returns) is a gap.
         values = {name: value for name, value in values.items() if math.isfinite(value)}
         self.store.append(self.num_timesteps, values)
         self._keep_if_best(values)
