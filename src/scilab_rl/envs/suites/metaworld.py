@@ -1,0 +1,230 @@
+"""Meta-World's 50 tasks for a Sawyer arm: the dense originals, and goal tasks for HER.
+
+``MetaW-drawer-close-v3`` is the original reward with the goal observed. ``-sparse`` and ``-dense``
+before the version make a goal task of it, for the tasks in `GOAL_TASKS`. The goal is drawn anew at
+each reset, unlike in Meta-World's own benchmarks, where it belongs to the instance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from gymnasium import spaces
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+from scilab_rl.envs.goal import cost_per_step, minus_distance
+
+_ALL = (0, 1, 2)
+_X, _Y, _Z = (0,), (1,), (2,)
+_REWARDS = {"sparse": cost_per_step, "dense": minus_distance}
+STEP_LIMIT = 500
+
+
+@dataclass(frozen=True)
+class GoalTask:
+    """What has to be where, as Meta-World's own criterion of success has it.
+
+    Attributes:
+        threshold: Distance up to which the goal counts as reached, in m.
+        axes: The axes on which the distance is measured.
+        part: What is brought there: ``object`` or ``gripper``.
+    """
+
+    threshold: float
+    axes: tuple[int, ...] = _ALL
+    part: str = "object"
+
+
+# One row per task whose success is a distance between a place in the observation and the target.
+GOAL_TASKS = {
+    "bin-picking": GoalTask(0.05),
+    "box-close": GoalTask(0.08),
+    "button-press": GoalTask(0.02, _Y),
+    "button-press-topdown": GoalTask(0.024, _Z),
+    "button-press-topdown-wall": GoalTask(0.024, _Z),
+    "button-press-wall": GoalTask(0.03, _Y),
+    "coffee-button": GoalTask(0.02, _Y),
+    "coffee-pull": GoalTask(0.07),
+    "coffee-push": GoalTask(0.07),
+    "dial-turn": GoalTask(0.07),
+    "door-close": GoalTask(0.08),
+    "door-lock": GoalTask(0.02, _Z),
+    "door-open": GoalTask(0.08, _X),
+    "door-unlock": GoalTask(0.02, _X),
+    "drawer-close": GoalTask(0.065),
+    "drawer-open": GoalTask(0.03, _Y),
+    "faucet-close": GoalTask(0.07),
+    "hand-insert": GoalTask(0.05),
+    "handle-press": GoalTask(0.02, _Z),
+    "handle-press-side": GoalTask(0.02, _Z),
+    "handle-pull": GoalTask(0.05, _Z),
+    "handle-pull-side": GoalTask(0.08),
+    "peg-unplug-side": GoalTask(0.07),
+    "pick-out-of-hole": GoalTask(0.07),
+    "pick-place": GoalTask(0.07),
+    "pick-place-wall": GoalTask(0.07),
+    "plate-slide": GoalTask(0.07),
+    "plate-slide-back": GoalTask(0.07),
+    "plate-slide-back-side": GoalTask(0.07),
+    "plate-slide-side": GoalTask(0.07),
+    "push": GoalTask(0.05),
+    "push-back": GoalTask(0.07),
+    "push-wall": GoalTask(0.07),
+    "reach": GoalTask(0.05, part="gripper"),
+    "reach-wall": GoalTask(0.05, part="gripper"),
+    "shelf-place": GoalTask(0.07),
+    "soccer": GoalTask(0.07),
+    "sweep": GoalTask(0.05),
+    "sweep-into": GoalTask(0.05, (0, 1)),
+    "window-close": GoalTask(0.05, _X),
+    "window-open": GoalTask(0.05, _X),
+}
+
+
+class MetaWorld(gym.Env):
+    """A task of Meta-World with its original reward, and a new goal at each reset.
+
+    The observation is Meta-World's: gripper, objects, the same one step before, and the goal.
+
+    Args:
+        task: Its name without version, such as ``drawer-close``.
+        render_mode: None, ``rgb_array`` or ``human``.
+    """
+
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 80}  # noqa: RUF012 - Gymnasium's
+
+    def __init__(self, task: str, render_mode: str | None = None) -> None:
+        self.task = task
+        self.render_mode = render_mode
+        self.inner: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"](
+            render_mode=render_mode,  # type: ignore[arg-type]
+            camera_name="corner2",
+        )
+        # What Meta-World's benchmarks set from outside: goals that are drawn and observed.
+        self.inner._set_task_called = True
+        self.inner._freeze_rand_vec = False
+        self.inner.seeded_rand_vec = True
+        self.inner._partially_observable = False
+        # Remembered for hidden goals, it would clip the observed goal to zero.
+        self.inner.__dict__.pop("sawyer_observation_space", None)
+        # Places beyond the declared bounds do occur at the reset.
+        self.observation_space: Any = spaces.Box(-np.inf, np.inf, (39,), np.float64)
+        self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
+
+    @property
+    def model(self) -> Any:
+        """MuJoCo's model."""
+        return self.inner.model
+
+    @property
+    def data(self) -> Any:
+        """MuJoCo's state."""
+        return self.inner.data
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+        """Begin an episode with a new goal."""
+        super().reset(seed=seed)
+        self.inner.np_random = self.np_random  # one generator for all chance
+        observation, _ = self.inner.reset()
+        return observation, {"is_success": False}
+
+    def step(self, action: np.ndarray) -> Any:
+        """Act for one step."""
+        observation, reward, _, _, info = self.inner.step(np.asarray(action, dtype=np.float32))
+        success = bool(info["success"])
+        return observation, float(reward), False, False, {**info, "is_success": success}
+
+    def render(self) -> Any:
+        """Return a frame."""
+        return self.inner.render()
+
+    def close(self) -> None:
+        """Free the graphics memory."""
+        self.inner.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle as a new environment with the same arguments."""
+        return type(self), (self.task, self.render_mode)
+
+
+class MetaWorldGoal(MetaWorld):
+    """A task of Meta-World as a goal task, by its row in `GOAL_TASKS`.
+
+    Args:
+        task: Its name without version.
+        reward_type: ``sparse`` (0 at the goal, else -1) or ``dense`` (minus the distance).
+        render_mode: None, ``rgb_array`` or ``human``.
+    """
+
+    def __init__(
+        self, task: str, reward_type: str = "sparse", render_mode: str | None = None
+    ) -> None:
+        super().__init__(task, render_mode)
+        self.reward_type = reward_type
+        self.goal_task = GOAL_TASKS[task]
+        goal = spaces.Box(-np.inf, np.inf, (len(self.goal_task.axes),), np.float64)
+        self.observation_space = spaces.Dict(
+            observation=self.observation_space, achieved_goal=goal, desired_goal=goal
+        )
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+        """Begin an episode with a new goal."""
+        observation = self._with_goals(super().reset(seed=seed, options=options)[0])
+        return observation, {"is_success": self._is_success(observation)}
+
+    def step(self, action: np.ndarray) -> Any:
+        """Act for one step; the original reward is kept as ``info["own_reward"]``."""
+        vector, own_reward, terminated, truncated, info = super().step(action)
+        observation = self._with_goals(vector)
+        info = {**info, "is_success": self._is_success(observation), "own_reward": own_reward}
+        goals = observation["achieved_goal"], observation["desired_goal"]
+        return observation, float(self.compute_reward(*goals, info)), terminated, truncated, info
+
+    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """Return the reward. Shapes: goals ``(..., n_axes)``, result ``(...)``."""
+        distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
+        return _REWARDS[self.reward_type](distance, self.goal_task.threshold)
+
+    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+        """Return False: reaching the goal does not end the episode. Shapes: as the reward's."""
+        return np.zeros(np.shape(achieved_goal)[:-1], dtype=bool)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle as a new environment with the same arguments."""
+        return type(self), (self.task, self.reward_type, self.render_mode)
+
+    def _with_goals(self, vector: np.ndarray) -> dict[str, np.ndarray]:
+        axes = list(self.goal_task.axes)
+        target = np.asarray(self.inner._target_pos)
+        return {
+            "observation": vector,
+            "achieved_goal": self._place(vector)[axes],
+            "desired_goal": target[axes],
+        }
+
+    def _place(self, vector: np.ndarray) -> np.ndarray:
+        if self.goal_task.part == "gripper":
+            return self.inner.tcp_center
+        return vector[4:7]
+
+    def _is_success(self, observation: dict[str, np.ndarray]) -> bool:
+        difference = observation["achieved_goal"] - observation["desired_goal"]
+        return bool(np.linalg.norm(difference) <= self.goal_task.threshold)
+
+
+def register() -> None:
+    """Register all tasks, and the goal tasks in both rewards."""
+    for task in sorted(name.removesuffix("-v3") for name in ALL_V3_ENVIRONMENTS):
+        _register(f"MetaW-{task}-v3", "MetaWorld", task=task)
+        if task in GOAL_TASKS:
+            for kind in _REWARDS:
+                _register(f"MetaW-{task}-{kind}-v3", "MetaWorldGoal", task=task, reward_type=kind)
+
+
+def _register(env_id: str, cls: str, **arguments: str) -> None:
+    if env_id not in gym.registry:
+        entry_point = f"{__name__}:{cls}"
+        gym.register(env_id, entry_point, max_episode_steps=STEP_LIMIT, kwargs=arguments)
