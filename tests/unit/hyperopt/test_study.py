@@ -61,6 +61,7 @@ def test_small_space_is_tried_completely_and_then_raced(tmp_path: Path) -> None:
     assert runs[0.0] == 2, "0.0 is far behind and must not earn further repeats"
 
 
+@pytest.mark.slow
 def test_one_worker_draws_the_same_settings_after_a_kill(tmp_path: Path) -> None:
     whole = toy.run(tmp_path / "whole", n_workers=1, max_trials=8)
     part = toy.run(tmp_path / "parts", n_workers=1, max_trials=8, max_duration_minutes=1e-4)
@@ -132,6 +133,7 @@ def test_hopeless_runs_are_pruned_and_their_settings_are_out(tmp_path: Path) -> 
     assert told == out
 
 
+@pytest.mark.slow
 def test_several_objectives_give_every_setting_the_same_repeats(tmp_path: Path) -> None:
     study = toy.run(
         tmp_path / "study", score=["final", "steps_to_threshold"],
