@@ -102,6 +102,8 @@ FAMILIES = (
         r"o(?P<n_blocks>[0-4])-gripper_(?P<gripper_goal>none|random|above)",
         _read_blocks,
     ),
+    Family("CoppeliaReach-v0", "scilab_rl.envs.coppeliasim_tasks:CoppeliaReach", 50),
+    Family("CoppeliaDrive-v0", "scilab_rl.envs.coppeliasim_tasks:CoppeliaDrive", 100),
     Family(
         "Hook-v1",
         "scilab_rl.envs.hook:Hook",
