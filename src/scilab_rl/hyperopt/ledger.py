@@ -13,7 +13,7 @@ import fcntl
 import os
 import secrets
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any
 
@@ -50,6 +50,7 @@ class Ledger:
         (directory / "locks").mkdir(parents=True, exist_ok=True)
         self.owner = f"{os.getpid()}-{secrets.token_hex(4)}"
         self._lease: IO[str] | None = None
+        self._trials: list[FrozenTrial] | None = None
         with self.locked():
             self.study = optuna.create_study(
                 storage=_open_storage(storage or f"sqlite:///{directory / DATABASE}"),
@@ -63,6 +64,7 @@ class Ledger:
         """Keep all other processes out of this study for the moment of a decision."""
         with (self.directory / "locks" / "study.lock").open("w") as file:
             fcntl.flock(file, fcntl.LOCK_EX)
+            self.refresh()  # others may have written since
             yield
 
     def definition(self) -> dict[str, Any] | None:
@@ -83,8 +85,21 @@ class Ledger:
         self.study.set_user_attr(f"{_RUN_KEY}{run.number:06d}", run.as_json())
 
     def trials(self, *states: TrialState) -> list[FrozenTrial]:
-        """Return the settings, all or those in some states."""
-        return self.study.get_trials(deepcopy=False, states=states or None)
+        """Return the settings, all or those in some states, as they were at the last refresh."""
+        if self._trials is None:
+            self._trials = self.study.get_trials(deepcopy=False)
+        return [trial for trial in self._trials if not states or trial.state in states]
+
+    def refresh(self) -> None:
+        """Forget what was read; call it after a change."""
+        self._trials = None
+
+    def tell(
+        self, trial: int, values: Sequence[float] | None = None, state: TrialState | None = None
+    ) -> None:
+        """Let the sampler know what has become of a setting."""
+        self.study.tell(trial, values, state)
+        self.refresh()
 
     def hold_lease(self) -> None:
         """Sign as alive; the kernel withdraws the signature when this process ends, however."""

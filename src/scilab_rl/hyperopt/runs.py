@@ -10,8 +10,6 @@ from typing import Any
 from scilab_rl.hyperopt.race import Entry
 
 RUNNING, COMPLETE, PRUNED, FAILED, LOST = "running", "complete", "pruned", "failed", "lost"
-# A lost run was ended by the machine and is repeated; it costs nothing of the budget.
-COUNTED = (RUNNING, COMPLETE, PRUNED, FAILED)
 FINAL_REPEAT = 10_000  # repeats from here on are the re-evaluation of the winner
 
 
@@ -24,7 +22,8 @@ class Run:
         trial: Number of the Optuna trial, that is of the setting.
         repeat: Which repeat of the setting; equal repeats of all settings share a seed.
         seed: Seed of the run.
-        state: ``running``, ``complete``, ``pruned``, ``failed``, or ``lost``: the machine ended it.
+        state: ``running``, ``complete``, ``pruned``, ``failed``, or ``lost``: the machine ended it,
+            and it will be repeated.
         owner: The process that watches it.
         started: Unix time, in seconds.
         scores: One number per objective, when complete.

@@ -67,19 +67,20 @@ class SettingsSource:
             number, setting = self._ask(n_settings, attempt)
             if setting not in earlier.values():
                 return number
-            self.ledger.study.tell(number, state=TrialState.FAIL)
+            self.ledger.tell(number, state=TrialState.FAIL)
         untried = self._untried()
         if not untried:
             return None
         if not self.ledger.trials(TrialState.WAITING):
             self.ledger.study.enqueue_trial(untried[0])
+            self.ledger.refresh()
         return self._ask(n_settings, _MOST_DUPLICATES)[0]
 
     def discard_torn(self) -> None:
         """Give up trials whose process was killed while it was asking the sampler."""
         for trial in self.ledger.trials(TrialState.RUNNING):
             if len(trial.params) < len(self._expected(trial.params)):
-                self.ledger.study.tell(trial.number, state=TrialState.FAIL)
+                self.ledger.tell(trial.number, state=TrialState.FAIL)
 
     def _ask(self, n_settings: int, attempt: int) -> tuple[int, Setting]:
         study = self.ledger.study
@@ -87,7 +88,9 @@ class SettingsSource:
         study.sampler = make_sampler(self.sampler, self.seed, draw_seed)
         trial = study.ask()
         self.asked[trial.number] = trial
-        return trial.number, self.space.suggest(trial)
+        setting = self.space.suggest(trial)
+        self.ledger.refresh()
+        return trial.number, setting
 
     def _untried(self) -> list[Setting]:
         tried = settings_of(self.ledger.trials()).values()

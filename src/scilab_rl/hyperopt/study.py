@@ -148,6 +148,7 @@ class Study:
         with self.ledger.locked():
             self.runs = self.ledger.recover_lost_runs(self.ledger.runs())
             self._note_reasons_to_stop()
+            self._drop_pointless()
             self._tell_decided()
             while not self.stop.reason and self.pool.has_room():
                 run = self._next_run()
@@ -159,20 +160,20 @@ class Study:
 
     def _next_run(self) -> Run | None:
         """Return the next run to start, already noted as running, or None for now."""
-        out = {entry.number for entry in self._entries() if entry.out}
         for run in self.runs:
-            if run.state == LOST and run.trial not in out:
+            if run.state == LOST:
                 return self._started(run.with_(attempt=run.attempt + 1))
+        entries = self._entries()
         decision = race.decide(
-            self._entries(),
+            entries,
             self.settings.rules,
-            n_used=sum(run.state != LOST and not run.is_final for run in self.runs),
+            n_used=sum(not run.is_final for run in self.runs),
             n_left=self.source.n_left(),
         )
         if decision.action == race.RUN:
             return self._new_run(decision.number, self._next_repeat(decision.number))
         if decision.action == race.ASK:
-            number = self.source.ask(len(self._entries()))
+            number = self.source.ask(len(entries))
             if number is not None:
                 return self._new_run(number, 0)
         if decision.action == race.DONE or not any(r.state == RUNNING for r in self.runs):
@@ -285,6 +286,13 @@ class Study:
             error = f"it ran longer than trial_timeout ({limit:g} s)"
             self._change(self._failure(self.runs[number], error, by_machine=False))
 
+    def _drop_pointless(self) -> None:
+        """Do not repeat a lost run whose setting is out by now."""
+        out = {entry.number for entry in self._entries() if entry.out}
+        for run in self.runs:
+            if run.state == LOST and run.trial in out and not run.is_final:
+                self._store(run.with_(state=PRUNED, error="its setting was out already"))
+
     def _tell_decided(self) -> None:
         """Tell the sampler about settings whose first repeats are done, or that are out."""
         self.source.discard_torn()
@@ -296,19 +304,19 @@ class Study:
             if entry.out and not entry.n_running:
                 self._tell_out(entry.number, runs)
             elif not entry.out and len(entry.scores) >= self.settings.min_trials_per_param:
-                self.ledger.study.tell(entry.number, _mean_scores(runs))
+                self.ledger.tell(entry.number, _mean_scores(runs))
 
     def _tell_out(self, trial: int, runs: Sequence[Run]) -> None:
         """Tell the sampler about a setting that failed or was pruned."""
         if any(run.state == FAILED for run in runs):
-            self.ledger.study.tell(trial, state=TrialState.FAIL)
+            self.ledger.tell(trial, state=TrialState.FAIL)
             return
         asked = self.source.asked.get(trial)
         pruned = next(run for run in runs if run.state == PRUNED)
         if asked is not None:  # how bad it was is what the sampler learns
             for epoch, value in enumerate(pruned.values, start=1):
                 asked.report(value, epoch)
-        self.ledger.study.tell(trial, state=TrialState.PRUNED)
+        self.ledger.tell(trial, state=TrialState.PRUNED)
 
     def _note_reasons_to_stop(self) -> None:
         self.pruning.learn_from(self.runs)

@@ -35,16 +35,17 @@ def _answer(task: Task, connection: Any) -> Message:
     if "error" in given:
         return Message("failed", {"error": given["error"], "machine": False})
     if "nan" in given:
-        return Message("finished", _result([float("nan")] * N_EPOCHS, "finished"))
+        return Message("finished", _result([float("nan")] * N_EPOCHS, "finished", time.monotonic()))
     values: list[float] = []
+    started = time.monotonic()
     for epoch in range(1, N_EPOCHS + 1):
         time.sleep(float(given.get("seconds", "0")) / N_EPOCHS)
         values.append((1 - (x - 0.7) ** 2) * epoch / N_EPOCHS + rng.gauss(0, 0.05))
         content = {"epoch": epoch, "step": epoch * EPOCH_STEPS, "value": values[-1]}
         connection.send(Message("evaluated", content))
         if not connection.recv():
-            return Message("finished", _result(values, "pruned"))
-    return Message("finished", _result(values, "finished"))
+            return Message("finished", _result(values, "pruned", started))
+    return Message("finished", _result(values, "finished", started))
 
 
 def _break(given: dict[str, str], connection: Any) -> None:
@@ -65,6 +66,11 @@ def _break(given: dict[str, str], connection: Any) -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def _result(values: list[float], status: str) -> dict[str, Any]:
-    steps = [EPOCH_STEPS * (i + 1) for i in range(len(values))]
-    return {"status": status, "run_dir": "", "seconds": 0.1, "steps": steps, "values": values}
+def _result(values: list[float], status: str, started: float) -> dict[str, Any]:
+    return {
+        "status": status,
+        "run_dir": "",
+        "seconds": time.monotonic() - started,
+        "steps": [EPOCH_STEPS * (i + 1) for i in range(len(values))],
+        "values": values,
+    }
