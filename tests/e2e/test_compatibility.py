@@ -36,6 +36,12 @@ COMMANDS = [
         "+normalize_reward=1",
         "FetchReach-v4",
     ),
+    (
+        "python src/main.py env=Blocks-o0-gripper_random-v1 algorithm=cleansac wandb=0",
+        "Blocks-o0-gripper_random-v1",
+    ),
+    ("python src/main.py env=Reach1DOF-v0 algorithm=cleansac wandb=0", "Reach1DOF-v0"),
+    ("python src/main.py algorithm=actor_critic env=Reach1DOF-v0 +flatten_obs=1", "Reach1DOF-v0"),
     ("python src/main.py algorithm=ppo env=CartPole-v1 +time_aware_observation=1", "CartPole-v1"),
 ]
 

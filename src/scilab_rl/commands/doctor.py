@@ -43,6 +43,7 @@ EXTRAS = {
     "metaworld": "metaworld",
     "highway": "highway_env",
     "myosuite": "myosuite",
+    "panda": "panda_gym",
     "coppeliasim": "coppeliasim_zmqremoteapi_client",
 }
 _PINNED = "pip install -c constraints.txt -e ."

@@ -23,6 +23,7 @@ SUITES: dict[str, tuple[str, tuple[str, ...]]] = {
     "metaworld": ("metaworld", ("MetaW", "Meta-World")),
     "highway_env": ("highway", ("parking", "highway", "merge", "roundabout", "intersection")),
     "myosuite": ("myosuite", ("myo",)),
+    "panda_gym": ("panda", ("Panda",)),
 }
 _VERSIONED = re.compile(r"(?P<name>.*?)(?:-v(?P<version>\d+))?", re.DOTALL)
 # Entry points of ids that stay registered and can no longer be made.

@@ -13,6 +13,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
 from scilab_rl.envs.goal import cost_per_step, minus_distance
@@ -21,6 +22,7 @@ _ALL = (0, 1, 2)
 _X, _Y, _Z = (0,), (1,), (2,)
 _REWARDS = {"sparse": cost_per_step, "dense": minus_distance}
 STEP_LIMIT = 500
+_CAMERA = {"distance": 1.7, "azimuth": -45.0, "elevation": -30.0, "lookat": (0.0, 0.6, 0.15)}
 
 
 @dataclass(frozen=True)
@@ -99,9 +101,10 @@ class MetaWorld(gym.Env):
     def __init__(self, task: str, render_mode: str | None = None) -> None:
         self.task = task
         self.render_mode = render_mode
-        self.inner: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"](
-            render_mode=render_mode,  # type: ignore[arg-type]
-            camera_name="corner2",
+        self.inner: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"](render_mode=render_mode)  # type: ignore[arg-type]
+        # Meta-World's own cameras hang upside down or see half of the table.
+        self.inner.mujoco_renderer = MujocoRenderer(
+            self.inner.model, self.inner.data, _CAMERA, width=480, height=480, camera_id=-1
         )
         # What Meta-World's benchmarks set from outside: goals that are drawn and observed.
         self.inner._set_task_called = True
