@@ -1,4 +1,4 @@
-"""How long a checkpoint with a full replay buffer of 1M FetchPush transitions takes, and its memory.
+"""Time and memory of a checkpoint with a full replay buffer of 1M FetchPush transitions.
 
 Run: python benchmarks/checkpoint_1m.py [--transitions N]
 """

@@ -1,7 +1,7 @@
 """The figure of the Scilab-RL paper: does the critics' variance rise when the block falls?
 
 Takes an agent that was trained on FetchPush, pushes the block over the edge of the table by a
-script, at least 20 times, and looks at the variance of the agent's critics before, at and after the fall.
+script, at least 20 times, and looks at the variance of its critics before, at and after the fall.
 Writes a picture, a table and a Wilcoxon test, whatever they say.
 
 Run: make figure-fetchpush, or python scripts/figure_fetchpush.py RUN [--falls 20]

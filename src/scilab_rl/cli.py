@@ -93,7 +93,17 @@ def _dispatch(arguments: list[str]) -> int:
             f"There is no command '{first}'.{did_you_mean(first, COMMANDS)} "
             f"Commands: {', '.join(COMMANDS)}. To train, give KEY=VALUE, for example env=FetchPush."
         )
-    return train(arguments[1:] if first == "train" else arguments)
+    return train(_with_host_as_key(arguments[1:] if first == "train" else arguments))
+
+
+def _with_host_as_key(arguments: list[str]) -> list[str]:
+    """Turn ``--host ADDRESS`` into the key ``viewer_host``."""
+    if "--host" not in arguments:
+        return arguments
+    index = arguments.index("--host")
+    if index + 1 == len(arguments):
+        raise ConfigError("--host needs an address, for example --host 0.0.0.0.")
+    return [*arguments[:index], f"viewer_host={arguments[index + 1]}", *arguments[index + 2 :]]
 
 
 def config_keys() -> list[str]:

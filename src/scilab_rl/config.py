@@ -9,7 +9,6 @@ from __future__ import annotations
 import importlib.util
 import logging
 import math
-import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -97,6 +96,7 @@ KEYS = (
         "with render=record: keep only moments, such as 'critic_variance > p99' or 'object fell'",
         optional=True,
     ),
+    Key("viewer_host", TEXT, "address of the live view; others than 127.0.0.1 let others look"),
     Key("base_logdir", TEXT, "folder of all runs"),
     Key("restore_policy", TEXT, "folder of a saved policy to start from", optional=True),
     Key(
@@ -163,10 +163,11 @@ def compose(overrides: Sequence[str]) -> DictConfig:
         tuned = tuned_option(cfg)
         if tuned is None:
             return cfg
+        check_keys(cfg)  # errors before notices
         _log.info(
             "Tuned values for %s are used: %s (off with tuned=false).",
             tuned.replace("/", " with "),
-            os.path.relpath(config_files("tuned_values")[tuned]),
+            _near(config_files("tuned_values")[tuned]),
         )
         return hydra.compose("main", overrides=[f"+tuned_values={tuned}", *overrides])
     except Exception as error:
@@ -243,6 +244,11 @@ def friendly_override(argument: str) -> str:
     """
     bare = re.sub(r"^\+{1,2}(?=[a-z])", "", argument)
     return f"++{bare}" if bare.startswith(_OPEN_GROUPS) and "=" in bare else argument
+
+
+def _near(path: Path) -> Path:
+    """Return a path as seen from here when it is below here."""
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def tuned_option(cfg: DictConfig) -> str | None:

@@ -354,6 +354,7 @@ def show_episodes(
         render_freq=cfg.render_freq,
         render_frames_per_clip=cfg.render_frames_per_clip,
         record_when=cfg.record_when,
+        viewer_host=cfg.viewer_host,
         render_metrics_train=list(cfg.render_metrics_train),
         render_metrics_test=list(cfg.render_metrics_test),
         n_test_rollouts=cfg.n_test_rollouts,

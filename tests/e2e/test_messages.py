@@ -72,7 +72,7 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def _run(argument: str, capsys: pytest.CaptureFixture[str]) -> tuple[int, str]:
     arguments = [argument, "mlflow=0"]
-    if "env" not in argument:
+    if not argument.startswith(("env=", "env_kwargs")):
         arguments.append(TINY)
     if not argument.lstrip("+").startswith("algorithm="):
         arguments.append("algorithm=sac")

@@ -40,6 +40,7 @@ class ShowingPlan:
         render_metrics_train: Metrics beside training episodes.
         render_metrics_test: Metrics beside evaluation episodes.
         n_test_rollouts: Evaluation episodes per epoch.
+        viewer_host: Address that the live view listens on.
         env_id: Id of the environment.
         algorithm: Name of the algorithm.
     """
@@ -51,6 +52,7 @@ class ShowingPlan:
     render_metrics_train: Sequence[str]
     render_metrics_test: Sequence[str]
     n_test_rollouts: int
+    viewer_host: str
     env_id: str
     algorithm: str
 
@@ -244,7 +246,7 @@ def _make_sink(
     if plan.render == DISPLAY:
         from scilab_rl.visualization.live import LiveViewer
 
-        return LiveViewer(panels)
+        return LiveViewer(panels, host=plan.viewer_host)
     from scilab_rl.visualization.recorder import ClipRecorder
 
     def give_to_trackers(path: Path) -> None:

@@ -51,6 +51,10 @@ class LiveViewer:
         self, panels: tuple[str, ...], *, host: str = LOOPBACK, window: bool | None = None
     ) -> None:
         rerun = import_rerun("for the live view (render=display)")
+        if host != LOOPBACK:
+            _log.warning(
+                "The live view listens on %s: everybody who can reach this machine can look.", host
+            )
         self._recording = rerun.RecordingStream(APPLICATION)
         self.data_port = free_port(DATA_PORT, host)
         sink = rerun.GrpcServerSink(bind_ip=host, port=self.data_port, server_memory_limit=_MEMORY)

@@ -46,7 +46,7 @@ def test_all_commands_keys_and_wrappers_are_explained(text):
         r"n_epochs=60 +most epochs \(whole number from 1\)",
         r"tuned=true +.*",
         r"info='' +a note .*",
-        r"render=none +.* \(none \| record.*\)",
+        r"render_freq=5 +.* \(whole number from 1\)",
         r"restore_policy=null +.* \(text \| null\)",
         r"mlflow=auto +.* \(0 \| 1 \| auto\)",
     ],
