@@ -45,8 +45,16 @@ class Test{camel}(AlgorithmContract):
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
-    parser = CommandParser("new", "Create an algorithm of your own as a copy of an existing one.")
-    parser.add_argument("kind", choices=("algorithm",), help="what is to be created")
+    if arguments[:1] == ["environment"]:
+        from scilab_rl.commands import new_environment
+
+        return new_environment.main(arguments[1:])
+    parser = CommandParser(
+        "new",
+        "Create an algorithm of your own as a copy of an existing one, or an environment "
+        "(`scilab-rl new environment --help`).",
+    )
+    parser.add_argument("kind", choices=("algorithm", "environment"), help="what is to be created")
     parser.add_argument("name", help="its name, for example my_idea")
     parser.add_argument(
         "--from",
