@@ -33,7 +33,7 @@ from scilab_rl.workspace import open_desk
 
 FOUR = "render_metrics_test=[q_value,critic_variance,goal_distance,reward]"
 FOUR_TRAIN = "render_metrics_train=[q_value,critic_variance,goal_distance,reward]"
-REPEATS = 3
+REPEATS, STUCK_REPEATS, STUCK_STEPS = 3, 6, 400
 
 
 def main() -> None:
@@ -108,15 +108,15 @@ def shown_frames_per_second() -> float:
 def stuck_viewer_speed() -> float:
     """Return the speed of shown training with a stopped viewer, relative to a running one."""
     speeds: dict[bool, list[float]] = {False: [], True: []}
-    for stuck in [False, True] * REPEATS:
+    for stuck in [False, True] * STUCK_REPEATS:
         session = make_session("env=FetchReach", "render=display", FOUR_TRAIN)
         viewer = session.showing.sinks[0]
         if stuck and viewer._child is not None:
             os.kill(viewer._child.pid, signal.SIGSTOP)
-        session.showing.train.show(1, 4)
+        session.showing.train.show(1, STUCK_STEPS // 50)
         started = time.perf_counter()
-        session.algorithm.learn(200, callback=session.trainer)
-        speeds[stuck].append(200 / (time.perf_counter() - started))
+        session.algorithm.learn(STUCK_STEPS, callback=session.trainer)
+        speeds[stuck].append(STUCK_STEPS / (time.perf_counter() - started))
         if stuck and viewer._child is not None:
             os.kill(viewer._child.pid, signal.SIGCONT)
         close(session)
