@@ -27,7 +27,7 @@ from typing import Any
 
 import hydra
 
-from scilab_rl import config, experiment
+from scilab_rl import assembly, config, experiment
 from scilab_rl.results import RunDirectory
 from scilab_rl.workspace import open_desk
 
@@ -127,7 +127,7 @@ def make_session(*overrides: str) -> Any:
     """Build a run in a temporary folder."""
     base = Path(tempfile.mkdtemp())
     given = [*overrides, "algorithm=cleansac", "mlflow=0", "seed=1", f"base_logdir={base}"]
-    cfg = experiment.complete(config.compose([*given, "++algorithm.buffer_size=10000"]))
+    cfg = assembly.complete(config.compose([*given, "++algorithm.buffer_size=10000"]))
     directory = RunDirectory.create(base, cfg.env, "bench", 1)
     session = experiment.build(cfg, directory)
     session.trackers.trackers.clear()

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import wilcoxon
 
-from scilab_rl import experiment
+from scilab_rl import assembly
 from scilab_rl.algorithms.inspection import Inspection
 from scilab_rl.config import load_recorded
 from scilab_rl.envs.vectorize import make_eval_env
@@ -90,17 +90,17 @@ def _parse() -> argparse.Namespace:
 
 
 def _agent(run: Any) -> tuple[Any, Any]:
-    cfg = experiment.complete(load_recorded(run / CONFIG_FILE))
-    experiment.prepare_torch(cfg)
+    cfg = assembly.complete(load_recorded(run / CONFIG_FILE))
+    assembly.prepare_torch(cfg)
     choose_backend()
     settings = dataclasses.replace(
-        experiment.env_settings(cfg),
+        assembly.env_settings(cfg),
         env_kwargs={"max_episode_steps": STEPS_PER_EPISODE},
         render_mode="rgb_array",
     )
     env = make_eval_env(settings)
     cfg.algorithm.buffer_size = 1000
-    model = experiment.make_algorithm(cfg, env)
+    model = assembly.make_algorithm(cfg, env)
     load_policy(model, run / "rl_model_finished")
     return env, model
 

@@ -48,7 +48,7 @@ def describe_all() -> list[dict[str, Any]]:
 
 
 def _describe(name: str, path: Path) -> dict[str, Any]:
-    from scilab_rl import experiment
+    from scilab_rl import assembly
     from scilab_rl.algorithms.compatibility import reads_dictionaries, supported_action_spaces
 
     row: dict[str, Any] = {
@@ -64,7 +64,7 @@ def _describe(name: str, path: Path) -> dict[str, Any]:
         cfg = config.compose([f"algorithm={name}", "tuned=false"])
         config.check_keys(cfg)
         row["class"] = cfg.algorithm._target_
-        cls = experiment.algorithm_class(cfg)
+        cls = assembly.algorithm_class(cfg)
         row["actions"] = [space.__name__ for space in supported_action_spaces(cls) or ()]
         row["hindsight"] = _hindsight(cfg.algorithm) if reads_dictionaries(cls) else "no"
     except Exception as error:  # noqa: BLE001 - whatever a desk file raises, the list goes on

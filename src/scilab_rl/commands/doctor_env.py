@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import hydra
 
-from scilab_rl import config, experiment
+from scilab_rl import assembly, config
 from scilab_rl.findings import Finding
 from scilab_rl.workspace import open_desk
 
@@ -28,12 +28,12 @@ def examine(overrides: Sequence[str], n_steps: int) -> list[Finding]:
     open_desk()
     with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
         overrides = [config.friendly_override(word) for word in overrides]
-        cfg = experiment.complete(config.compose(["tuned=false", *overrides]))
+        cfg = assembly.complete(config.compose(["tuned=false", *overrides]))
     # Imported late: Gymnasium takes its time.
     from scilab_rl.envs import examination, fingerprint
     from scilab_rl.envs.vectorize import make_single_env
 
-    settings = experiment.env_settings(cfg)
+    settings = assembly.env_settings(cfg)
     known = () if settings.env_kwargs or settings.wrappers else fingerprint.known(cfg.env)
     _log.info("Examining %s with %d random steps.", cfg.env, n_steps)
     found = examination.examine(

@@ -92,19 +92,19 @@ def policy_folder(run: RunDirectory, options: argparse.Namespace) -> Path:
 
 def load_player(cfg: Any, folder: Path, *, record: bool) -> tuple[Any, Any]:
     """Make the evaluation environment of a run and the algorithm with its saved weights."""
-    from scilab_rl import experiment
+    from scilab_rl import assembly
     from scilab_rl.envs.vectorize import make_eval_env
     from scilab_rl.training.trainer import load_policy
 
-    cfg = experiment.complete(cfg)
-    experiment.prepare_torch(cfg)
-    settings = experiment.env_settings(cfg)
+    cfg = assembly.complete(cfg)
+    assembly.prepare_torch(cfg)
+    settings = assembly.env_settings(cfg)
     env = make_eval_env(
-        replace(settings, render_mode=experiment.render_mode("record" if record else "none"))
+        replace(settings, render_mode=assembly.render_mode("record" if record else "none"))
     )
     if "buffer_size" in cfg.algorithm:
         cfg.algorithm.buffer_size = min(cfg.algorithm.buffer_size, _SMALL_BUFFER)
-    model = experiment.make_algorithm(cfg, env)
+    model = assembly.make_algorithm(cfg, env)
     load_policy(model, folder)
     return env, model
 

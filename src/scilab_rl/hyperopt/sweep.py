@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from scilab_rl import config, experiment
+from scilab_rl import assembly, config
 from scilab_rl.errors import ConfigError, ScilabRLError, SomeRunsFailedError
 from scilab_rl.files import write_text
 from scilab_rl.hyperopt.folders import DEFINITION_FILE, STUDIES
@@ -177,7 +177,7 @@ def check_runs(request: Request, space: SearchSpace) -> DictConfig:
     for parameter in space.parameters:
         if parameter.exists_in(example):
             example[parameter.name] = (parameter.labels or (parameter.low,))[0]
-    experiment.complete(config.compose([*request.fixed, *space.overrides(example)]))
+    assembly.complete(config.compose([*request.fixed, *space.overrides(example)]))
     return config.prepare(config.compose(request.fixed))
 
 

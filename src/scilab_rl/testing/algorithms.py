@@ -28,7 +28,7 @@ import pytest
 from omegaconf import DictConfig, OmegaConf
 from stable_baselines3.common.callbacks import BaseCallback
 
-from scilab_rl import config, experiment
+from scilab_rl import assembly, config
 from scilab_rl.algorithms.arguments import FRAMEWORK_PARAMETERS, allowed_arguments
 from scilab_rl.algorithms.compatibility import check_pair
 from scilab_rl.envs.registration import resolve_env_id
@@ -216,8 +216,8 @@ class AlgorithmContract:
     def build(self, *, n_envs: int = 1, seed: int = _SEED) -> Any:
         """Build the algorithm as a run does, with small networks and batches."""
         cfg = self._configuration(n_envs, seed)
-        experiment.prepare_torch(cfg)
-        model = experiment.make_algorithm(cfg, make_train_env(experiment.env_settings(cfg)))
+        assembly.prepare_torch(cfg)
+        model = assembly.make_algorithm(cfg, make_train_env(assembly.env_settings(cfg)))
         model.set_logger(MetricLogger())
         return model
 
@@ -247,7 +247,7 @@ class AlgorithmContract:
         return hydra.utils.get_class(_composed(self.algorithm)["_target_"])
 
     def _observations(self, n_envs: int = 1) -> Any:
-        settings = experiment.env_settings(self._configuration(n_envs, _SEED + 2))
+        settings = assembly.env_settings(self._configuration(n_envs, _SEED + 2))
         return make_train_env(settings).reset()
 
 

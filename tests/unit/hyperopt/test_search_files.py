@@ -6,7 +6,7 @@ import hydra
 import pytest
 from omegaconf import OmegaConf
 
-from scilab_rl import config, experiment
+from scilab_rl import assembly, config
 from scilab_rl.hyperopt.space import SearchSpace, parse_space
 from scilab_rl.workspace import SHIPPED_CONF, config_files
 
@@ -39,7 +39,7 @@ def test_both_ends_of_every_parameter_reach_the_algorithm(
         setting = {
             p.name: p.labels[end] if p.choices else (p.low, p.high)[end] for p in space.parameters
         }
-        cfg = experiment.complete(
+        cfg = assembly.complete(
             config.compose([f"+search={name}", f"env={env}", *space.overrides(setting)])
         )
         for parameter in space.parameters:
