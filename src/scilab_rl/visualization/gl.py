@@ -46,7 +46,8 @@ def probe(backend: str) -> str | None:
         return "no picture after 60 s"
     if done.returncode == 0:
         return None
-    lines = done.stderr.strip().splitlines()
+    # What half-made renderers say in their destructors is not the cause.
+    lines = done.stderr.partition("Exception ignored")[0].strip().splitlines()
     return lines[-1] if lines else f"exit code {done.returncode}"
 
 
