@@ -143,7 +143,11 @@ def test_several_objectives_give_every_setting_the_same_repeats(tmp_path: Path) 
 
 
 def test_deleted_stop_file_ends_the_study_after_the_running_runs(tmp_path: Path) -> None:
-    threading.Timer(1.5, (tmp_path / "study" / STOP_FILE).unlink).start()
+    def delete_soon_after_the_start() -> None:
+        wait_for_runs(tmp_path / "study", 3)
+        (tmp_path / "study" / STOP_FILE).unlink()
+
+    threading.Thread(target=delete_soon_after_the_start).start()
     study = toy.run(tmp_path / "study", "seconds=0.3", max_trials=200)
     assert "stop file" in study.stop.reason
     assert {run.state for run in study.runs} <= {COMPLETE, PRUNED}
