@@ -22,7 +22,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
 
-demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 4 minutes)
+demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 5 minutes)
 	$(BIN)/python src/main.py algorithm=sac env=FetchReach-v4 seed=1
 	$(BIN)/python src/main.py play last --episodes 20 --record
 
