@@ -53,17 +53,17 @@ def run(
     """
     cfg = complete(cfg)
     directory = RunDirectory.create(Path(cfg.base_logdir), cfg.env, cfg.algorithm.name, cfg.seed)
-    try:
-        with directory.in_use(), _log_file(directory / "train.log"):
+    with directory.in_use(), _log_file(directory / "train.log"):
+        try:
             session = build(cfg, directory)
-            session.begin()
-            provenance.write(directory, overrides, session.eval_env.envs[0])
-            if watch is not None:
-                watch(session)
-            return session.learn()
-    except ConfigError:
-        directory.discard()
-        raise
+        except ConfigError:
+            directory.discard()
+            raise
+        session.begin()
+        provenance.write(directory, overrides, session.eval_env.envs[0])
+        if watch is not None:
+            watch(session)
+        return session.learn()
 
 
 def resume(
