@@ -101,7 +101,8 @@ class MetaWorld(gym.Env):
     def __init__(self, task: str, render_mode: str | None = None) -> None:
         self.task = task
         self.render_mode = render_mode
-        self.inner: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"](render_mode=render_mode)  # type: ignore[arg-type]
+        make: Any = ALL_V3_ENVIRONMENTS[f"{task}-v3"]
+        self.inner = make(render_mode=render_mode)
         # Meta-World's own cameras hang upside down or see half of the table.
         self.inner.mujoco_renderer = MujocoRenderer(
             self.inner.model, self.inner.data, _CAMERA, width=480, height=480, camera_id=-1
