@@ -74,7 +74,7 @@ def test_sweep_over_algorithms_goes_on_after_a_failure(desk: Path) -> None:
     done = scilab_rl(
         "--multirun", "algorithm=sac,dqn,td3", "env=Pendulum-v1", *SHORT, cwd=desk, timeout=300
     )
-    assert done.returncode == 2
+    assert done.returncode == 3  # the sweep has finished, and some runs failed
     assert "dqn needs Discrete actions" in done.stderr
     results = list(desk.glob("data/*/*/result.json"))
     assert len(results) == 2
