@@ -118,6 +118,7 @@ def test_nothing_is_asked_of_steps_that_are_not_shown(monkeypatch: pytest.Monkey
     monkeypatch.setattr(env.envs[0].unwrapped, "render", pytest.fail)
     env.reset()
     play(env, 25)
+    assert not timeline.sinks[0].clips
 
 
 @pytest.fixture
