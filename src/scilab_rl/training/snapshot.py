@@ -13,6 +13,7 @@ normalisation). What is not: environments, loggers, functions, spaces apart from
 from __future__ import annotations
 
 import random
+import sys
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -152,6 +153,8 @@ class _Capture:
             return self._array(value, path, rows)
         if isinstance(value, (dict, list, tuple, deque)):
             return self._container(value, path, rows)
+        if _is_jax_array(value):
+            return self._tensor(torch.from_numpy(np.array(value)), path) | {"@kind": "jax"}
         if isinstance(value, _CLOSED) or id(value) in self.seen:
             return {"@kind": "skip"}
         self.seen.add(id(value))
@@ -201,7 +204,7 @@ class _Capture:
             return {"@kind": "dict", "entries": entries}
         entries = [self.describe(entry, f"{path}.{i}", rows) for i, entry in enumerate(value)]
         return {
-            "@kind": type(value).__name__ if not _is_named_tuple(value) else "skip",
+            "@kind": type(value).__name__ if not _is_named_tuple(value) else "named_tuple",
             "entries": entries,
         }
 
@@ -313,6 +316,19 @@ class _Restore:
     def _put_tuple(self, current: Any, node: Node) -> tuple:
         return tuple(self._put_list(list(current or ()), node))
 
+    def _put_named_tuple(self, current: Any, node: Node) -> Any:
+        if current is None:
+            raise ValueError("a tuple with names has nothing to be put into")
+        return type(current)(*self._put_list(list(current), node))
+
+    def _put_jax(self, current: Any, node: Node) -> Any:
+        import jax.numpy as jnp
+
+        saved = self.snapshot.tensors[node["name"]]
+        if current is not None and current.shape != saved.shape:
+            raise ValueError(f"{node['name']} has shape {_shape(saved)}, not {_shape(current)}")
+        return jnp.array(saved.numpy(), device=getattr(current, "device", None))
+
     def _put_deque(self, current: Any, node: Node) -> deque:
         restored: deque = deque(maxlen=getattr(current, "maxlen", None))
         restored.extend(self.put(None, entry) for entry in node["entries"])
@@ -366,6 +382,12 @@ class _Restore:
 
 def _shape(value: Any) -> tuple[int, ...]:
     return tuple(value.shape)
+
+
+def _is_jax_array(value: Any) -> bool:
+    """Tell without importing JAX, which is an optional package."""
+    jax = sys.modules.get("jax")
+    return jax is not None and isinstance(value, jax.Array)
 
 
 def _is_named_tuple(value: Any) -> bool:
