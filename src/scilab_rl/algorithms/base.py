@@ -32,6 +32,7 @@ from scilab_rl.algorithms.observations import (
     to_vector,
     with_terminal_observations,
 )
+from scilab_rl.algorithms.replay import HindsightReplayBuffer
 from scilab_rl.errors import ConfigError, NumericalError
 from scilab_rl.metrics.logger import MetricLogger
 
@@ -273,6 +274,8 @@ class OneFileAlgorithm(ABC):
             where the episode ended in a terminal state.
         """
         assert self.replay_buffer is not None
+        if isinstance(self.replay_buffer, HindsightReplayBuffer):
+            return self.replay_buffer.sample_vectors(batch_size, env=self._vec_normalize_env)
         batch = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
         return batch._replace(
             observations=self.to_vector(batch.observations),

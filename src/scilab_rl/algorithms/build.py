@@ -16,6 +16,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from scilab_rl.algorithms.arguments import INTRINSIC, accepts
 from scilab_rl.algorithms.compatibility import is_goal_space, is_image_space
 from scilab_rl.algorithms.intrinsic.build import reward_intrinsically, rewarding
+from scilab_rl.algorithms.replay import HindsightReplayBuffer, can_hold
 from scilab_rl.errors import ConfigError
 
 _log = logging.getLogger(__name__)
@@ -32,8 +33,8 @@ def build_algorithm(
     """Build an algorithm with what follows from the environment filled in.
 
     ``policy: auto`` becomes the policy class for the observations, ``replay_buffer_class: auto``
-    hindsight experience replay for goal environments, and a scalar action noise gets the shape of
-    the actions.
+    hindsight experience replay for goal environments (``her`` is Stable-Baselines3's), and a scalar
+    action noise gets the shape of the actions.
 
     Args:
         cls: The class that ``_target_`` names.
@@ -79,7 +80,8 @@ def policy_name(env: VecEnv) -> str:
 def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:
     chosen, has_goals = arguments["replay_buffer_class"], is_goal_space(env.observation_space)
     if chosen == "auto":
-        chosen = HerReplayBuffer if has_goals else None
+        ours = HindsightReplayBuffer if can_hold(env.observation_space) else HerReplayBuffer
+        chosen = ours if has_goals else None
     elif chosen == "her":
         chosen = HerReplayBuffer
     arguments["replay_buffer_class"] = chosen

@@ -6,6 +6,7 @@ random generator just before ``reset`` and the actions since then lead to the sa
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import gymnasium as gym
@@ -65,6 +66,16 @@ class ReplayableEpisode(gym.Wrapper):
         for action in actions:
             observation = self.env.step(action)[0]
         return observation
+
+    def pickled_method(self, name: str) -> bytes | None:
+        """Return a method with a copy of its environment, or None where that cannot be pickled.
+
+        For pure functions, such as ``compute_reward``, that another process calls often.
+        """
+        try:
+            return pickle.dumps(self.get_wrapper_attr(name))
+        except Exception:  # noqa: BLE001 - any object may fail in its own way
+            return None
 
     def _generator(self) -> np.random.Generator:
         return self.env.unwrapped.np_random

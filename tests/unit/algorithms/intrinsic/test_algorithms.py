@@ -68,14 +68,14 @@ def test_weight_changes_what_is_learned(exam, algorithm):
 def test_hindsight_samples_carry_the_mixed_reward(exam):
     model = exam("sac", small("rnd", weight=0.5, normalize="none")).trained()
     buffer, intrinsic = model.replay_buffer, model.intrinsic
-    assert type(buffer).__name__ == "RewardingHerReplayBuffer"
-    state = np.random.get_state()
+    assert type(buffer).__name__ == "RewardingHindsightReplayBuffer"
+    state = buffer.random.bit_generator.state
     with torch.no_grad():
         buffer.intrinsic = None
         plain = buffer.sample(64)
         expected = intrinsic.reward(plain.observations, plain.actions, plain.next_observations)
         buffer.intrinsic = intrinsic
-    np.random.set_state(state)
+    buffer.random.bit_generator.state = state
     mixed = buffer.sample(64)
     assert set(plain.rewards.flatten().tolist()) == {-1.0, 0.0}  # some goals were put in
     torch.testing.assert_close(mixed.rewards.flatten(), 0.5 * plain.rewards[:, 0] + 0.5 * expected)
