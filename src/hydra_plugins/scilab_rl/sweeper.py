@@ -25,9 +25,10 @@ class StudySweeper(BasicSweeper):
 
         assert self.config is not None and self.hydra_context is not None
         sweeper = OmegaConf.to_container(self.config.hydra.sweeper, resolve=True)
-        assert isinstance(sweeper, dict)
+        launcher = OmegaConf.to_container(self.config.hydra.launcher, resolve=True)
+        assert isinstance(sweeper, dict) and isinstance(launcher, dict)
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         overrides = parser.parse_overrides([*self._parse_config(), *arguments])
         if sweep.is_study(sweeper, overrides):
-            return sweep.run_study(sweeper, overrides)
+            return sweep.run_study(sweeper, launcher, overrides)
         return super().sweep(arguments)

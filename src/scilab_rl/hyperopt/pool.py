@@ -50,7 +50,6 @@ class Pool:
         self.log_dir = log_dir
         self.main = main
         self.n_threads = max(1, n_cores() // size)
-        self.busy_seconds = 0.0
         self._workers: list[Worker] = []
         self._context = multiprocessing.get_context("spawn")
 
@@ -75,11 +74,6 @@ class Pool:
     def n_busy(self) -> int:
         """Workers that train a run."""
         return sum(one.job is not None for one in self._workers)
-
-    @property
-    def jobs(self) -> list[int]:
-        """The runs that are being trained."""
-        return [one.job for one in self._workers if one.job is not None]
 
     def has_room(self) -> bool:
         """Tell whether another run can begin at once."""
@@ -124,7 +118,7 @@ class Pool:
             except (EOFError, OSError):
                 message = Message("died", {"error": self._bury(one)})
             if message.kind in ("finished", "failed", "died"):
-                self._release(one)
+                one.job = None
             if job is not None and message.kind != "ready":
                 news.append((job, message))
         return news
@@ -140,7 +134,7 @@ class Pool:
         for one in late:
             one.process.kill()
             self._bury(one)
-            self._release(one)
+            one.job = None
         return jobs
 
     def kill_all(self) -> None:
@@ -158,11 +152,6 @@ class Pool:
         theirs.close()
         self._workers.append(Worker(process, ours))
         return self._workers[-1]
-
-    def _release(self, one: Worker) -> None:
-        if one.job is not None:
-            self.busy_seconds += time.monotonic() - one.busy_since
-        one.job = None
 
     def _bury(self, one: Worker) -> str:
         """Remove a dead worker and return how it died."""

@@ -13,6 +13,7 @@ from typing import Any
 from optuna.trial import TrialState
 
 from scilab_rl.hyperopt import race, scores
+from scilab_rl.hyperopt.jobs import JobPool
 from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.pool import Pool
 from scilab_rl.hyperopt.pruning import Pruning
@@ -78,7 +79,7 @@ class Study:
 
     Args:
         ledger: Its memory, shared with other processes.
-        pool: The workers of this process.
+        pool: What trains the runs: workers of this process, or jobs of a scheduler.
         space: The search space.
         settings: What the study shall do.
         plan: What all runs have in common.
@@ -88,7 +89,7 @@ class Study:
     def __init__(
         self,
         ledger: Ledger,
-        pool: Pool,
+        pool: Pool | JobPool,
         space: SearchSpace,
         settings: StudySettings,
         plan: RunPlan,

@@ -17,8 +17,8 @@ from scilab_rl import assembly, config
 from scilab_rl.errors import ConfigError, ScilabRLError, SomeRunsFailedError
 from scilab_rl.files import write_text
 from scilab_rl.hyperopt.folders import DEFINITION_FILE, STUDIES
+from scilab_rl.hyperopt.launchers import open_pool
 from scilab_rl.hyperopt.ledger import Ledger
-from scilab_rl.hyperopt.pool import Pool, n_cores
 from scilab_rl.hyperopt.report import write_report
 from scilab_rl.hyperopt.samplers import require_packages
 from scilab_rl.hyperopt.settings import StudySettings, read_settings
@@ -83,11 +83,14 @@ def is_study(sweeper: Mapping[str, Any], overrides: Sequence[Override]) -> bool:
     return named or any(isinstance(override.value(), IntervalSweep) for override in overrides)
 
 
-def run_study(sweeper: Mapping[str, Any], overrides: Sequence[Override]) -> None:
+def run_study(
+    sweeper: Mapping[str, Any], launcher: Mapping[str, Any], overrides: Sequence[Override]
+) -> None:
     """Run, continue or join a study, and leave its report behind.
 
     Args:
         sweeper: The mapping ``hydra.sweeper``.
+        launcher: The mapping ``hydra.launcher``.
         overrides: The command line.
 
     Raises:
@@ -125,10 +128,9 @@ def run_study(sweeper: Mapping[str, Any], overrides: Sequence[Override]) -> None
     )
     from scilab_rl.hyperopt.progress import StudyProgress
 
-    size = n_workers(settings.n_jobs)
     with (
-        Pool(size, directory / "workers") as pool,
-        StudyProgress(directory, settings, size) as progress,
+        open_pool(launcher, settings.n_jobs, directory) as pool,
+        StudyProgress(directory, settings, pool.size) as progress,
     ):
         study = Study(ledger, pool, space, settings, plan, progress)
         with _signals_to(study):
@@ -179,17 +181,6 @@ def check_runs(request: Request, space: SearchSpace) -> DictConfig:
             example[parameter.name] = (parameter.labels or (parameter.low,))[0]
     assembly.complete(config.compose([*request.fixed, *space.overrides(example)]))
     return config.prepare(config.compose(request.fixed))
-
-
-def n_workers(n_jobs: int | None) -> int:
-    """Return how many runs go on at once: never more than there are cores.
-
-    A run keeps one core busy. More of them at a time end no sooner and need more memory.
-    """
-    cores = n_cores()
-    if n_jobs is not None and n_jobs > cores:
-        _log.info("n_jobs=%d, but there are %d cores: %d runs at a time.", n_jobs, cores, cores)
-    return min(n_jobs or cores, cores)
 
 
 def _define(

@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 _PR_SET_PDEATHSIG = 1
 _OUT_OF_MEMORY = ("out of memory", "can't allocate memory", "cannot allocate memory")
@@ -48,6 +48,16 @@ class Message:
     content: Mapping[str, Any] = field(default_factory=dict)
 
 
+class Channel(Protocol):
+    """A run's end of the line to its study."""
+
+    def send(self, message: Message, /) -> None:
+        """Say something."""
+
+    def recv(self) -> Any:
+        """Wait for the answer to an evaluation: whether to go on."""
+
+
 def main(connection: Connection, log_path: str, n_threads: int) -> None:
     """Train what comes through the connection until it closes.
 
@@ -65,12 +75,18 @@ def main(connection: Connection, log_path: str, n_threads: int) -> None:
     connection.send(Message("ready"))
     with contextlib.suppress(EOFError, OSError):  # the study has ended
         while (task := connection.recv()) is not None:
-            connection.send(_train(task, connection))
+            connection.send(train(task, connection))
 
 
-def _train(task: Task, connection: Connection) -> Message:
+def train(task: Task, channel: Channel) -> Message:
+    """Train one run and return what has become of it.
+
+    Args:
+        task: The run.
+        channel: To the study, for what happens meanwhile.
+    """
     try:
-        return Message("finished", _run(task, connection))
+        return Message("finished", _run(task, channel))
     except (EOFError, BrokenPipeError):
         raise
     except Exception as error:  # noqa: BLE001 - a crash is a result, whatever it is
@@ -78,7 +94,7 @@ def _train(task: Task, connection: Connection) -> Message:
         return Message("failed", {"error": text, "machine": _blames_machine(error)})
 
 
-def _run(task: Task, connection: Connection) -> dict[str, Any]:
+def _run(task: Task, channel: Channel) -> dict[str, Any]:
     from scilab_rl import experiment
     from scilab_rl.results import RunDirectory, read_epochs
 
@@ -87,13 +103,13 @@ def _run(task: Task, connection: Connection) -> dict[str, Any]:
     def may_go_on(step: int, epoch: int, values: Mapping[str, float]) -> bool:
         nonlocal told_to_stop
         value = experiment.criterion_of(values, task.criterion)
-        connection.send(Message("evaluated", {"epoch": epoch, "step": step, "value": value}))
-        told_to_stop = not connection.recv()
+        channel.send(Message("evaluated", {"epoch": epoch, "step": step, "value": value}))
+        told_to_stop = not channel.recv()
         return not told_to_stop
 
     def watch(session: experiment.Session) -> None:
         session.trainer.may_go_on.append(may_go_on)
-        connection.send(Message("started", {"run_dir": str(session.directory)}))
+        channel.send(Message("started", {"run_dir": str(session.directory)}))
 
     result = _start_or_continue(task, watch)
     # The file holds the whole curve, also of a run that was continued.

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -29,16 +30,19 @@ def run(
     *overrides: str,
     space: SearchSpace = SPACE,
     n_workers: int = 2,
+    storage: str | None = None,
+    open_pool: Callable[[Path], Any] | None = None,
     **sweeper: Any,
 ) -> Study:
-    """Run a toy study to its end."""
+    """Run a toy study to its end, with workers of this process unless ``open_pool`` says other."""
     given = {"max_trials": 12, "min_trials_per_param": 2, "n_final_runs": 1, "seed": 5} | sweeper
     settings = read_settings(given)
-    ledger = Ledger(directory, directions=settings.directions)
+    ledger = Ledger(directory, storage, settings.directions)
     plan = RunPlan(overrides, "eval/success_rate", N_EPOCHS, N_EPOCHS * EPOCH_STEPS, 0.9, seed=5)
     with ledger.locked():
         ledger.define(definition(space, settings))
-    with Pool(n_workers, directory / "workers", main=toy_worker.main) as pool:
+    pools = Pool(n_workers, directory / "workers", main=toy_worker.main)
+    with open_pool(directory) if open_pool else pools as pool:
         study = Study(ledger, pool, space, settings, plan)
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda number, _: study.interrupt(number))

@@ -16,18 +16,19 @@ N_EPOCHS, EPOCH_STEPS = 4, 100
 
 
 def main(connection: Any, log_path: str, n_threads: int) -> None:
-    """Follow the protocol of `worker.main`, with faults where the overrides ask for them."""
+    """Follow the protocol of `worker.main`."""
     _die_with_parent()
     os.setsid()
     connection.send(Message("ready"))
     try:
         while (task := connection.recv()) is not None:
-            connection.send(_answer(task, connection))
+            connection.send(train(task, connection))
     except (EOFError, OSError):
         return
 
 
-def _answer(task: Task, connection: Any) -> Message:
+def train(task: Task, connection: Any) -> Message:
+    """The same as `worker.train`, with faults where the overrides ask for them."""
     given = {k.lstrip("+"): v for k, _, v in (o.partition("=") for o in task.overrides)}
     x, rng = float(given["x"]), random.Random(int(given["seed"]))
     connection.send(Message("started", {"run_dir": f"runs/{given['x']}"}))
@@ -46,6 +47,14 @@ def _answer(task: Task, connection: Any) -> Message:
         if not connection.recv():
             return Message("finished", _result(values, "pruned", started))
     return Message("finished", _result(values, "finished", started))
+
+
+def train_on_ray(task: Task, channel: Any) -> Message:
+    """The same, and note on which node."""
+    import ray
+
+    (channel.folder / "node").write_text(ray.get_runtime_context().get_node_id())
+    return train(task, channel)
 
 
 def _break(given: dict[str, str], connection: Any) -> None:
