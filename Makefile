@@ -2,12 +2,12 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-EXTRAS := dev,mlflow,wandb,tensorboard,view
+EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim
 # Two cores learn as fast as one on small networks, but two test workers halve the waiting.
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check format test test-slow demo figure-fetchpush mlflow clean-venv
+.PHONY: help setup check format test test-slow test-myosuite demo figure-fetchpush mlflow clean-venv
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -41,6 +41,14 @@ test: $(VENV)/.installed  ## the fast tests
 
 test-slow: $(VENV)/.installed  ## the slow and the performance tests (an hour)
 	$(BIN)/python -m pytest -m "slow or performance"
+
+.venv-myosuite/.installed: pyproject.toml constraints-myosuite.txt
+	$(PYTHON) -m venv .venv-myosuite
+	.venv-myosuite/bin/pip install --quiet -c constraints-myosuite.txt -e ".[dev,myosuite]"
+	@touch $@
+
+test-myosuite: .venv-myosuite/.installed  ## the tests of MyoSuite, in a virtual environment of its own
+	.venv-myosuite/bin/python -m pytest tests/unit/envs/suites/test_myosuite.py
 
 figure-fetchpush: setup  ## the paper's figure: critic variance while the block falls (about 10 minutes)
 	$(BIN)/python src/main.py algorithm=sac_var env=FetchPush-v1 seed=1 n_epochs=6 n_test_rollouts=5 \

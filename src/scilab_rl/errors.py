@@ -30,12 +30,13 @@ class MissingDependencyError(ConfigError):
         package: The package that failed to import.
         extra: The extra of Scilab-RL that installs it.
         purpose: What it is needed for, as in "to track runs with MLflow".
+        pip_options: What pip has to be told, with a space at its end.
     """
 
-    def __init__(self, package: str, extra: str, purpose: str) -> None:
+    def __init__(self, package: str, extra: str, purpose: str, pip_options: str = "") -> None:
         super().__init__(
             f"{package} is needed {purpose} and is not installed. "
-            f'Install it with: pip install "scilab-rl[{extra}]"'
+            f'Install it with: pip install {pip_options}"scilab-rl[{extra}]"'
         )
 
 

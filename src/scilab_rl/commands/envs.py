@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import importlib.util
 import logging
+from collections.abc import Sequence
 from typing import Any
 
 from scilab_rl.commands.parser import CommandParser
@@ -12,66 +12,88 @@ from scilab_rl.workspace import open_desk
 
 _log = logging.getLogger(__name__)
 
-_COLUMNS = ("env", "steps", "suite", "older")
+_COLUMNS = ("env", "steps", "goal", "action", "observation", "suite", "older")
 _DETAILS = ("env", "observation", "action", "goal", "steps", "problem")
-_OPTIONAL = ("older", "suite", "steps")
+_SUITE_COLUMNS = ("suite", "installed", "brings", "install", "conflicts", "note")
+_OPTIONAL = ("older", "suite", "observation", "steps", "action")
 
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     parser = CommandParser(
         "envs",
-        "List the environments and their step limits: env=NAME trains in one. With names, make "
-        "these environments and show their spaces and whether they have goals.",
+        "List the environments, and the packages that they come from: env=NAME trains in one. With "
+        "names, make these environments and show them as they are now.",
     )
     parser.add_argument("names", nargs="*", metavar="NAME", help="an id or a part of one")
+    parser.add_argument("--suites", action="store_true", help="only the packages")
     parser.add_argument("--json", action="store_true", help="print JSON")
     options = parser.parse_args(arguments)
 
     open_desk()
     if options.names:
         rows = [describe(env_id) for env_id in _fitting(options.names)]
-        columns = [c for c in _DETAILS if c != "problem" or any(row["problem"] for row in rows)]
-    else:
-        rows, columns = list_all(), list(_COLUMNS)
-    if options.json:
-        print_json(rows)
+        shown = [c for c in _DETAILS if c != "problem" or any(row["problem"] for row in rows)]
+        _print(shown, rows, as_json=options.json)
         return 0
-    print_rows(columns, rows, optional=[c for c in _OPTIONAL if c in columns])
-    if not options.names:
-        _log.info("`scilab-rl envs NAME` shows the spaces of those whose id contains NAME.")
-        for package, install in missing_suites().items():
-            _log.info("Not installed: %s. Install it with: %s", package, install)
+    if not options.suites:
+        _print(_COLUMNS, list_all(), as_json=options.json)
+        _log.info("`scilab-rl envs NAME` makes and shows those whose id contains NAME.")
+        _log.info("`scilab-rl envs --suites` tells how to install more, and what conflicts.")
+        for suite in list_suites():
+            if not suite["installed"]:
+                _log.info(
+                    "Not installed: %s. Install it with: %s", suite["suite"], suite["install"]
+                )
+        return 0
+    _print(_SUITE_COLUMNS, list_suites(), as_json=options.json)
     return 0
+
+
+def _print(columns: Sequence[str], rows: list[dict[str, Any]], *, as_json: bool) -> None:
+    if as_json:
+        print_json(rows)
+    else:
+        print_rows(columns, rows, optional=[name for name in _OPTIONAL if name in columns])
+
+
+def list_suites() -> list[dict[str, Any]]:
+    """Return the packages with environments: whether they are there, how to get them, and traps."""
+    from scilab_rl.envs.suites import SUITES
+
+    return [
+        {
+            "suite": suite.package,
+            "installed": suite.installed,
+            "brings": suite.brings,
+            "install": suite.install_line or None,
+            "conflicts": suite.conflicts or None,
+            "note": suite.note or None,
+        }
+        for suite in SUITES
+    ]
 
 
 def list_all() -> list[dict[str, Any]]:
     """Return the newest usable version of each environment; none is made, so this is quick.
 
     Returns:
-        For each the id, the step limit (None: none), the package, and the older usable ids.
+        For each the id, the step limit (None: none), the package, the older usable ids, and, as
+        recorded with the pinned versions, its spaces and whether it has goals.
     """
     import gymnasium as gym
 
-    from scilab_rl.envs.registration import known_env_ids, versions_by_family
+    from scilab_rl.envs.recorded import spaces_of
+    from scilab_rl.envs.registration import known_env_ids, module_of, suite_of, versions_by_family
 
     rows = []
     for versions in versions_by_family(known_env_ids()).values():
         spec = gym.registry[versions[-1]]
-        row = {"env": spec.id, "steps": spec.max_episode_steps, "suite": _package(spec.entry_point)}
-        rows.append(row | {"older": versions[:-1]})
+        suite = suite_of(spec)
+        name = suite.package if suite else module_of(spec).partition(".")[0]
+        row = {"env": spec.id, "steps": spec.max_episode_steps, **spaces_of(spec.id)}
+        rows.append(row | {"suite": name, "older": versions[:-1]})
     return rows
-
-
-def missing_suites() -> dict[str, str]:
-    """Return the packages with environments that are not installed, and how to install each."""
-    from scilab_rl.envs.registration import SUITES
-
-    return {
-        package: f'pip install "scilab-rl[{extra}]"'
-        for package, (extra, _) in SUITES.items()
-        if importlib.util.find_spec(package) is None
-    }
 
 
 def describe(env_id: str) -> dict[str, Any]:
@@ -132,9 +154,3 @@ def _fitting(names: list[str]) -> list[str]:
                 _log.info(notice)
         fitting += found
     return list(dict.fromkeys(fitting))
-
-
-def _package(entry_point: Any) -> str:
-    """Return the package that an environment comes from."""
-    module = entry_point if isinstance(entry_point, str) else getattr(entry_point, "__module__", "")
-    return module.partition(":")[0].partition(".")[0]

@@ -12,19 +12,9 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
 from scilab_rl.envs.ids import register_shipped, register_variant
+from scilab_rl.envs.suites import SUITES, Suite, suite_of_module, suite_of_name
 from scilab_rl.errors import ConfigError, MissingDependencyError, did_you_mean
 
-# Suites that register their ids only when they are imported: package -> (extra, start of its ids).
-SUITES: dict[str, tuple[str, tuple[str, ...]]] = {
-    "gymnasium_robotics": (
-        "robotics",
-        ("Fetch", "Hand", "Adroit", "FrankaKitchen", "PointMaze", "AntMaze"),
-    ),
-    "metaworld": ("metaworld", ("MetaW", "Meta-World")),
-    "highway_env": ("highway", ("parking", "highway", "merge", "roundabout", "intersection")),
-    "myosuite": ("myosuite", ("myo",)),
-    "panda_gym": ("panda", ("Panda",)),
-}
 _VERSIONED = re.compile(r"(?P<name>.*?)(?:-v(?P<version>\d+))?", re.DOTALL)
 # Entry points of ids that stay registered and can no longer be made.
 _ABANDONED = re.compile(r"MujocoPy|mujoco_py|_raise_shimmy_error")
@@ -56,14 +46,17 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
     parsed = _VERSIONED.fullmatch(name)
     assert parsed is not None  # the pattern fits every text
     family, version = parsed["name"], parsed["version"]
-    usable = _usable_versions(family)
+    specs = _usable_specs(family)
+    usable = [spec.version for spec in specs]
     if not usable and name not in gym.registry:
         raise ConfigError(
             f"No environment '{given}'.{_suggestion(name)} `scilab-rl envs` lists all."
         )
+    for spec in specs[:1]:
+        _require(suite_of(spec), given)
     if version is not None and (int(version) in usable or not usable):
         return given, None
-    newest = f"{family}-v{max(usable)}" if usable != [None] else family
+    newest = family if usable == [None] else f"{family}-v{max(v for v in usable if v is not None)}"
     if module:  # kept, so that other processes can import it too
         newest = f"{module}:{newest}"
     if version is None:
@@ -73,15 +66,15 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
 
 def known_env_ids() -> list[str]:
     """Return the usable ids of all installed suites."""
-    for package in SUITES:
-        if importlib.util.find_spec(package):
-            _register(package)
+    for suite in SUITES:
+        if suite.begins and suite.installed:
+            _register(suite.package)
     return [spec.id for spec in gym.registry.values() if _is_usable(spec)]
 
 
-def _usable_versions(family: str) -> list:
+def _usable_specs(family: str) -> list[EnvSpec]:
     return [
-        spec.version
+        spec
         for spec in gym.registry.values()
         if (f"{spec.namespace}/{spec.name}" if spec.namespace else spec.name) == family
         and _is_usable(spec)
@@ -89,17 +82,37 @@ def _usable_versions(family: str) -> list:
 
 
 def _is_usable(spec: EnvSpec) -> bool:
-    return not _ABANDONED.search(str(spec.entry_point))
+    return spec.entry_point is not None and not _ABANDONED.search(str(spec.entry_point))
+
+
+def suite_of(spec: EnvSpec) -> Suite | None:
+    """Return the suite of a registered environment; None for one of somebody else's."""
+    return suite_of_module(module_of(spec))
+
+
+def module_of(spec: EnvSpec) -> str:
+    """Return the module that a registered environment is made from."""
+    target = spec.entry_point
+    return (target if isinstance(target, str) else getattr(target, "__module__", "")).split(":")[0]
 
 
 def _register_suite_of(name: str) -> None:
-    if name in gym.registry and _is_usable(gym.registry[name]):
+    """Import the suite that a name is from.
+
+    Raises:
+        MissingDependencyError: If it is not installed.
+    """
+    suite = suite_of_name(name)
+    if suite is None or (not suite.installed and name in gym.registry):  # one of the user's own
         return
-    for package, (extra, beginnings) in SUITES.items():
-        if name.startswith(beginnings):
-            if importlib.util.find_spec(package) is None:
-                raise MissingDependencyError(package, extra, f"for the environment '{name}'")
-            _register(package)
+    _require(suite, name)
+    _register(suite.package)
+
+
+def _require(suite: Suite | None, name: str) -> None:
+    if suite is not None and not suite.installed:
+        purpose = f"for the environment '{name}'"
+        raise MissingDependencyError(suite.package, suite.extra, purpose, suite.pip_options)
 
 
 def _register(package: str) -> None:

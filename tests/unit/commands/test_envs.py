@@ -1,12 +1,16 @@
 import logging
 import subprocess
 import sys
+from importlib import metadata
 
 import gymnasium
 import pytest
 from gymnasium import spaces
 
 from scilab_rl.commands import envs
+from scilab_rl.envs.ids import FAMILIES
+from scilab_rl.envs.recorded import spaces_of
+from scilab_rl.envs.suites import SUITES, Suite
 from scilab_rl.errors import ConfigError
 
 from .conftest import read_json, read_table, write_file
@@ -25,10 +29,19 @@ def listed(desk, capsys):
 
 def test_the_newest_usable_versions_are_listed(listed):
     rows = listed()
-    fetch = {"env": "FetchReach-v4", "steps": 50, "suite": "gymnasium_robotics", "older": []}
-    assert rows["FetchReach-v4"] == fetch
+    assert rows["FetchReach-v4"] == {
+        "env": "FetchReach-v4",
+        "steps": 50,
+        "observation": "achieved_goal: Box(3), desired_goal: Box(3), observation: Box(10)",
+        "action": "Box(4) from -1 to 1",
+        "goal": True,
+        "suite": "gymnasium_robotics",
+        "older": [],
+    }
     assert rows["CartPole-v1"]["older"] == ["CartPole-v0"]
     assert rows["CartPole-v1"]["suite"] == "gymnasium"
+    assert rows["LunarLander-v3"]["suite"] == "Box2D"
+    assert rows["Reach1DOF-v0"]["suite"] == "scilab_rl"
     assert "CartPole-v0" not in rows
     assert not [name for name in rows if name.startswith("GymV2")]
 
@@ -77,13 +90,59 @@ def test_plain_lines(desk, capsys):
     rows = {row["env"]: row for row in read_table(capsys.readouterr().out)}
     assert rows["FetchPush-v4"]["steps"] == "50"
     assert rows["FetchPush-v4"]["older"] == "-"
+    assert rows["FetchPush-v4"]["goal"] == "yes"
 
 
-def test_missing_suites_name_their_extra(monkeypatch):
-    monkeypatch.setattr(envs.importlib.util, "find_spec", lambda name: None)
-    missing = envs.missing_suites()
-    assert missing["gymnasium_robotics"] == 'pip install "scilab-rl[robotics]"'
-    assert missing["metaworld"] == 'pip install "scilab-rl[metaworld]"'
+# Of each package one; what is recorded must be what is made.
+@pytest.mark.parametrize(
+    "env_id",
+    ["CartPole-v1", "FetchPush-v4", "Blocks-v1", "PointObjGym-v0", "ButtonUnlock-v1", "Hopper-v5"],
+)
+def test_recorded_spaces_are_those_of_the_environment(desk, env_id):
+    made = envs.describe(env_id)
+    assert spaces_of(env_id) == {key: made[key] for key in ("observation", "action", "goal")}
+
+
+def test_everything_shipped_is_recorded(listed):
+    rows = listed()
+    shipped = [family.env_id for family in FAMILIES]
+    shipped += [env_id for env_id in rows if env_id.startswith("MetaW-")]
+    assert [env_id for env_id in shipped if rows[env_id]["action"] is None] == []
+
+
+def test_what_is_not_recorded_is_unknown(desk, listed):
+    source = 'import gymnasium\n\ngymnasium.register("Mine-v0", entry_point="nowhere:Env")\n'
+    write_file(desk / "src/custom_envs/__init__.py", source)
+    row = listed()["Mine-v0"]
+    assert (row["suite"], row["action"], row["goal"]) == ("nowhere", None, None)
+    del gymnasium.registry["Mine-v0"]
+
+
+def test_suites_tell_what_is_there_how_to_get_the_rest_and_what_conflicts(
+    desk, capsys, monkeypatch
+):
+    monkeypatch.setattr(Suite, "installed", False)
+    assert envs.main(["--suites", "--json"]) == 0
+    rows = {row["suite"]: row for row in read_json(capsys.readouterr().out)}
+    assert not rows["metaworld"]["installed"]
+    assert rows["metaworld"]["install"] == 'pip install "scilab-rl[metaworld]"'
+    assert "mujoco==3.3.0" in rows["metaworld"]["conflicts"]
+    assert "-c constraints-myosuite.txt" in rows["myosuite"]["install"]
+    assert "metaworld" in rows["myosuite"]["conflicts"]
+    assert rows["gymnasium"]["install"] is None
+
+
+def test_each_extra_of_a_suite_exists(desk):
+    extras = {key.lower() for key in metadata.metadata("scilab-rl").get_all("Provides-Extra")}
+    assert {suite.extra for suite in SUITES if suite.extra} <= extras
+
+
+def test_the_list_ends_with_what_is_missing(desk, caplog, monkeypatch):
+    monkeypatch.setattr(logging.getLogger("scilab_rl"), "propagate", True)
+    monkeypatch.setitem(vars(SUITES[-1]), "package", "no_such_suite")
+    with caplog.at_level(logging.INFO, "scilab_rl"):
+        envs.main([])
+    assert "Not installed: no_such_suite. Install it with: pip install -c constr" in caplog.text
 
 
 @pytest.mark.parametrize(

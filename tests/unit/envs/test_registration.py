@@ -85,9 +85,20 @@ def test_a_module_that_cannot_be_imported_is_named():
 
 
 def test_a_suite_that_is_not_installed_comes_with_its_extra(monkeypatch):
-    monkeypatch.setitem(registration.SUITES, "no_such_suite", ("suite", ("Suite",)))
-    with pytest.raises(MissingDependencyError, match=r"scilab-rl\[suite\]"):
-        resolve_env_id("SuiteTask-v1")
+    monkeypatch.setattr(registration.Suite, "installed", False)
+    extras = {
+        "FetchReach": "robotics",
+        "MetaW-reach": "metaworld",
+        "parking-limited": "highway",
+        "PandaReach": "panda",
+        "myoHandPoseFixed": "myosuite",
+        "LunarLander": "box2d",
+        "BipedalWalker-v3": "box2d",
+        "CoppeliaReach-v0": "coppeliasim",
+    }
+    for env_id, extra in extras.items():
+        with pytest.raises(MissingDependencyError, match=rf"scilab-rl\[{extra}\]"):
+            resolve_env_id(env_id)
 
 
 def test_an_unversioned_id_of_ones_own_stays(monkeypatch):

@@ -4,17 +4,8 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from scilab_rl.envs import registration
 from scilab_rl.envs.registration import resolve_env_id
-from scilab_rl.errors import MissingDependencyError
 from scilab_rl.testing.goal_environments import EnvironmentContract
-
-
-def test_missing_package_names_the_extra(monkeypatch) -> None:
-    monkeypatch.setattr(registration.importlib.util, "find_spec", lambda name: None)
-    monkeypatch.delitem(gym.registry, "parking-limited-v0", raising=False)
-    with pytest.raises(MissingDependencyError, match=r'"scilab-rl\[highway\]"'):
-        resolve_env_id("parking-limited-v0")
 
 
 class TestParking(EnvironmentContract):
