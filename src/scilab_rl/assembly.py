@@ -177,6 +177,9 @@ def _import_target(target: str, key: str) -> Any:
     try:
         module = importlib.import_module(module_name)
     except ImportError as error:
+        if error.name in ("jax", "optax"):
+            purpose = f"for the compiled algorithms, such as {module_name.rpartition('.')[2]}"
+            raise MissingDependencyError(error.name, "jax", purpose) from error
         raise ConfigError(
             f"{key}._target_: '{target}' cannot be imported: {error}. The class in "
             f"src/custom_algorithms/my_idea.py is custom_algorithms.my_idea.CLASS."

@@ -219,13 +219,13 @@ class JAXSAC(OneFileAlgorithm):
 
     def explore(self) -> Tensor:
         """Choose the actions for the next step: random ones at first, and later now and then."""
-        random_actions = self.from_env_actions(self.sample_env_actions())
-        random_actions = torch.as_tensor(random_actions) * self.action_scale_factor
+        uniform = torch.as_tensor(self.from_env_actions(self.sample_env_actions()))
+        random_actions = self.action_scale_factor * uniform
         if self.num_timesteps < self.learning_starts:
             return random_actions
         actions = self.act(self.to_vector(self._last_obs), deterministic=False)
-        is_random = np.random.random((self.n_envs, 1)) < self.random_actions
-        return torch.where(torch.from_numpy(is_random), random_actions, actions)
+        is_random = torch.as_tensor(np.random.random((self.n_envs, 1)) < self.random_actions)
+        return torch.where(is_random, random_actions, actions)
 
     def act(self, observations: Tensor, deterministic: bool) -> Tensor:
         """Choose actions in [-1, 1], with the networks of the last finished round."""
