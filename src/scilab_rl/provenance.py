@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import json
 import platform
 import shlex
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import Any
 
-from scilab_rl import files
-from scilab_rl.results import RunDirectory
+import yaml
 
+from scilab_rl import files
+from scilab_rl.results import CONFIG_FILE, RunDirectory
+
+PROVENANCE_FILE = "provenance.json"
 _DIFF_LIMIT_BYTES = 1_000_000
+# The C loader is ten times faster, and there may be thousands of runs.
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+# What makes an environment: only runs that agree here are expected to agree in the fingerprint.
+_ENVIRONMENT_KEYS = (
+    "env", "env_kwargs", "wrappers", "flatten_obs", "clip_action", "normalize_obs",
+    "normalize_reward", "time_aware_observation",
+)  # fmt: skip
+# The packages that usually are the reason, by the names that they are installed under.
+_SIMULATION = ("mujoco", "gymnasium", "gymnasium-robotics", "metaworld", "highway-env", "MyoSuite")
 
 
 def write(directory: RunDirectory, overrides: Sequence[str], env: Any) -> None:
@@ -30,7 +43,7 @@ def write(directory: RunDirectory, overrides: Sequence[str], env: Any) -> None:
     if diff:
         files.write_text(directory / "git.diff", diff[:_DIFF_LIMIT_BYTES])
     files.write_json(
-        directory / "provenance.json",
+        directory / PROVENANCE_FILE,
         {
             "command": shlex.join(sys.argv),
             "overrides": list(overrides),
@@ -41,6 +54,60 @@ def write(directory: RunDirectory, overrides: Sequence[str], env: Any) -> None:
             "platform": platform.platform(),
             "versions": {d.name: d.version for d in sorted(metadata.distributions(), key=_name)},
         },
+    )
+
+
+def fingerprint_differences(runs: Iterable[RunDirectory]) -> list[str]:
+    """Tell which environments were not the same in runs that someone wants to compare.
+
+    Runs count as of the same environment when its id, arguments and wrappers are equal. Runs whose
+    files cannot be read are left out.
+
+    Args:
+        runs: The runs to compare.
+
+    Returns:
+        One line for each environment with more than one fingerprint; none when all is well.
+    """
+    groups: dict[str, dict[str, list[Mapping[str, Any]]]] = {}
+    for run in runs:
+        described = _described_environment(run)
+        if described is not None:
+            environment, source = described
+            fingerprints = groups.setdefault(environment, {})
+            fingerprints.setdefault(source["fingerprint"], []).append(source)
+    return [
+        _difference(json.loads(environment)["env"], sources)
+        for environment, sources in groups.items()
+        if len(sources) > 1
+    ]
+
+
+def _described_environment(run: RunDirectory) -> tuple[str, Mapping[str, Any]] | None:
+    """Return what the environment was told to be, and the run's provenance."""
+    try:
+        source = json.loads((run / PROVENANCE_FILE).read_text(encoding="utf-8"))
+        config = yaml.load((run / CONFIG_FILE).read_text(encoding="utf-8"), Loader=_LOADER)
+        told = {key: config[key] for key in _ENVIRONMENT_KEYS if config.get(key)}
+        return (json.dumps(told, sort_keys=True), source) if source["fingerprint"] else None
+    except (OSError, ValueError, TypeError, KeyError, AttributeError, yaml.YAMLError):
+        return None
+
+
+def _difference(env_id: str, sources: Mapping[str, Sequence[Mapping[str, Any]]]) -> str:
+    """Return the line about one environment; the most frequent fingerprint comes first."""
+    frequent = sorted(sources.items(), key=lambda item: -len(item[1]))
+    counts = ", ".join(f"{name} ({len(of_it)})" for name, of_it in frequent)
+    every = [source for of_it in sources.values() for source in of_it]
+    versions = {
+        package: sorted({str(source.get("versions", {}).get(package)) for source in every})
+        for package in _SIMULATION
+    }
+    reasons = [f"{name} {' / '.join(found)}" for name, found in versions.items() if len(found) > 1]
+    because = f" Versions differ: {', '.join(reasons)}." if reasons else ""
+    return (
+        f"{env_id} did not behave the same in these runs, so their results do not compare: its "
+        f"fingerprints (runs) are {counts}.{because}"
     )
 
 

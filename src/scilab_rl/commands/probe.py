@@ -11,6 +11,7 @@ from scilab_rl.commands.parser import CommandParser
 from scilab_rl.commands.view import chosen_recordings
 from scilab_rl.config import load_recorded
 from scilab_rl.errors import ConfigError
+from scilab_rl.provenance import fingerprint_differences
 from scilab_rl.results import CONFIG_FILE, RunDirectory, find_run
 from scilab_rl.workspace import open_desk
 
@@ -29,6 +30,9 @@ def main(arguments: list[str]) -> int:
     run = find_run(options.run, options.base_logdir)
     cfg = load_recorded(run / CONFIG_FILE)
     recordings = chosen_recordings(run, options.episode)
+    asked = [RunDirectory(_policy_folder(run, name).parent) for name in options.checkpoint]
+    for line in fingerprint_differences([run, *asked]):
+        _log.warning(line)
     minds = _minds(cfg, run, options.checkpoint)
     for path in recordings:
         clip = reprobe(load_clip(path), minds, options.metrics, cfg.algorithm.name)

@@ -15,6 +15,7 @@ import yaml
 
 from scilab_rl.commands.parser import CommandParser, positive
 from scilab_rl.commands.tables import print_json, print_rows
+from scilab_rl.provenance import fingerprint_differences
 from scilab_rl.results import CONFIG_FILE, RESULT_FILE, RunDirectory, all_runs, read_epochs
 
 _log = logging.getLogger(__name__)
@@ -51,6 +52,8 @@ def main(arguments: list[str]) -> int:
         and options.status in (None, record["status"])
     )
     records = list(itertools.islice(fitting, options.last))[::-1]
+    for line in fingerprint_differences(RunDirectory(Path(record["path"])) for record in records):
+        _log.warning(line)
     if options.json:
         print_json(records)
     elif records:

@@ -1,3 +1,5 @@
+import logging
+
 import pytest
 
 from scilab_rl.commands import runs
@@ -120,3 +122,19 @@ def test_no_runs_are_no_error(listed):
 def test_an_unknown_status_is_refused():
     with pytest.raises(ConfigError, match="stopped_early"):
         runs.main(["--status", "done"])
+
+
+def test_runs_whose_environment_has_changed_are_told(
+    make_run, tmp_path, caplog, capsys, monkeypatch
+):
+    monkeypatch.setattr(logging.getLogger("scilab_rl"), "propagate", True)
+    for name in ("100000-a", "100001-b", "100002-c"):
+        source = f'{{"fingerprint": "{name[-1:].replace("c", "b")}"}}'
+        (make_run(name, result()) / "provenance.json").write_text(source, encoding="utf-8")
+    runs.main(["--base-logdir", str(tmp_path / "data")])
+    (warning,) = caplog.messages
+    assert warning.startswith("FetchReach-v4 did not behave the same")
+    assert len(read_table(capsys.readouterr().out)) == 3
+    caplog.clear()
+    runs.main(["--base-logdir", str(tmp_path / "data"), "--last", "2"])
+    assert caplog.messages == []
