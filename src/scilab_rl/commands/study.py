@@ -14,11 +14,10 @@ from scilab_rl.commands.parser import CommandParser
 from scilab_rl.commands.tables import print_json, print_rows
 from scilab_rl.errors import ConfigError, MissingDependencyError
 from scilab_rl.files import write_text
-from scilab_rl.hyperopt.folders import DATABASE, find_study, study_names
+from scilab_rl.hyperopt.folders import find_study, study_names
 from scilab_rl.workspace import DESK_CONF, SHIPPED_CONF
 
 _log = logging.getLogger(__name__)
-_DASHBOARD_PORT = 8080
 
 
 def main(arguments: list[str]) -> int:
@@ -35,13 +34,14 @@ def main(arguments: list[str]) -> int:
     parser.add_argument(
         "--dashboard", action="store_true", help="browse it with optuna-dashboard, on this machine"
     )
+    parser.add_argument("--port", type=int, default=8080, help="of the dashboard; default: 8080")
     options = parser.parse_args(arguments)
     if options.name is None:
         _list(options.base_logdir)
         return 0
     directory = find_study(options.name, options.base_logdir)
     if options.dashboard:
-        return _open_dashboard(directory)
+        return _open_dashboard(directory, options.port)
     _show(directory, as_json=options.json)
     if options.write_tuned:
         _keep_winner(directory)
@@ -106,9 +106,12 @@ def _keep_winner(directory: Path) -> None:
     _log.info("Written to %s: later runs of this pair use it.", path)
 
 
-def _open_dashboard(directory: Path) -> int:
+def _open_dashboard(directory: Path, port: int) -> int:
     if importlib.util.find_spec("optuna_dashboard") is None:
         raise MissingDependencyError("optuna-dashboard", "hyperopt", "to browse a study")
-    command = Path(sys.executable).with_name("optuna-dashboard")
-    url = f"sqlite:///{directory / DATABASE}"
-    os.execv(command, [str(command), url, "--host", "127.0.0.1", "--port", str(_DASHBOARD_PORT)])
+    from scilab_rl.hyperopt.ledger import stored_url
+
+    command = str(Path(sys.executable).with_name("optuna-dashboard"))
+    _log.info("%s: http://127.0.0.1:%d (Ctrl-C ends it)", directory.name, port)
+    where = ["--host", "127.0.0.1", "--port", str(port)]
+    os.execv(command, [command, stored_url(directory), *where])

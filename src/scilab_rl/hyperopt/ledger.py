@@ -9,25 +9,32 @@ after the sampler has learnt from them, and a finished trial of Optuna cannot ch
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
+import re
 import secrets
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import optuna
 import yaml
 from optuna.trial import FrozenTrial, TrialState
 
-from scilab_rl.errors import ScilabRLError
+from scilab_rl.errors import MissingDependencyError, ScilabRLError
 from scilab_rl.files import write_text
 from scilab_rl.hyperopt.folders import DATABASE, DEFINITION_FILE, STOP_FILE
+from scilab_rl.hyperopt.locks import FileLocks, Locks, ServerLocks
 from scilab_rl.hyperopt.runs import LOST, RUNNING, Run
 
 _RUN_KEY, _DEFINITION = "run/", "definition"
-_LOCK_SECONDS = 60
+_LOCK_SECONDS, _ATTEMPTS = 60, 3
+_DRIVERS = {
+    "postgres": "postgresql+psycopg",
+    "postgresql": "postgresql+psycopg",
+    "mysql": "mysql+pymysql",
+    "mariadb": "mariadb+pymysql",
+}
 
 
 class Ledger:
@@ -47,13 +54,13 @@ class Ledger:
     ) -> None:
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         self.directory = directory
-        (directory / "locks").mkdir(parents=True, exist_ok=True)
+        self.url = database_url(directory, storage)
         self.owner = f"{os.getpid()}-{secrets.token_hex(4)}"
-        self._lease: IO[str] | None = None
         self._trials: list[FrozenTrial] | None = None
+        self._locks = _open_locks(directory, self.url)
         with self.locked():
             self.study = optuna.create_study(
-                storage=_open_storage(storage or f"sqlite:///{directory / DATABASE}"),
+                storage=_open_storage(self.url),
                 study_name=directory.name,
                 directions=[optuna.study.StudyDirection[word.upper()] for word in directions],
                 load_if_exists=True,
@@ -62,8 +69,7 @@ class Ledger:
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
         """Keep all other processes out of this study for the moment of a decision."""
-        with (self.directory / "locks" / "study.lock").open("w") as file:
-            fcntl.flock(file, fcntl.LOCK_EX)
+        with self._locks.exclusive():
             self.refresh()  # others may have written since
             yield
 
@@ -101,22 +107,18 @@ class Ledger:
         self.study.tell(trial, values, state)
         self.refresh()
 
-    def hold_lease(self) -> None:
-        """Sign as alive; the kernel withdraws the signature when this process ends, however."""
-        self._lease = self._lease_path(self.owner).open("w")
-        fcntl.flock(self._lease, fcntl.LOCK_EX)
+    def sign(self) -> None:
+        """Sign as a process that works on the study, until it ends or withdraws."""
+        self._locks.sign(self.owner)
 
-    def release_lease(self) -> None:
+    def withdraw(self) -> None:
         """Withdraw the signature."""
-        if self._lease is not None:
-            self._lease.close()
-            self._lease_path(self.owner).unlink(missing_ok=True)
-            self._lease = None
+        self._locks.withdraw()
 
     def recover_lost_runs(self, runs: list[Run]) -> list[Run]:
         """Mark runs whose process is gone as lost, and return all runs as they are then."""
         owners = {run.owner for run in runs if run.state == RUNNING} - {self.owner}
-        gone = {owner for owner in owners if not self._is_alive(owner)}
+        gone = {owner for owner in owners if not self._locks.is_alive(owner)}
         recovered = []
         for run in runs:
             if run.state == RUNNING and run.owner in gone:
@@ -136,39 +138,64 @@ class Ledger:
         """Tell whether the user has deleted the stop file."""
         return not (self.directory / STOP_FILE).exists()
 
-    def _lease_path(self, owner: str) -> Path:
-        return self.directory / "locks" / f"{owner}.lease"
-
-    def _is_alive(self, owner: str) -> bool:
-        try:
-            with self._lease_path(owner).open() as file:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except FileNotFoundError:
-            return False
-        except BlockingIOError:
-            return True
-        self._lease_path(owner).unlink(missing_ok=True)
-        return False
-
 
 def open_ledger(directory: Path) -> Ledger:
     """Open the memory of an existing study."""
+    return Ledger(directory, stored_url(directory))
+
+
+def stored_url(directory: Path) -> str:
+    """Return the URL of an existing study's database."""
     stored = yaml.safe_load((directory / DEFINITION_FILE).read_text(encoding="utf-8"))
-    return Ledger(directory, stored["sweeper"]["storage"])
+    return database_url(directory, stored["sweeper"]["storage"])
+
+
+def database_url(directory: Path, storage: str | None) -> str:
+    """Return the URL of a study's database, with the driver that we install.
+
+    Args:
+        directory: The folder of the study.
+        storage: As given; None means SQLite in the folder.
+    """
+    scheme, separator, rest = (storage or f"sqlite:///{directory / DATABASE}").partition("://")
+    return _DRIVERS.get(scheme, scheme) + separator + rest
+
+
+def _open_locks(directory: Path, url: str) -> Locks:
+    if url.startswith("sqlite"):
+        return FileLocks(directory / "locks")
+    directory.mkdir(parents=True, exist_ok=True)
+    import sqlalchemy
+
+    with _explained(url):
+        return ServerLocks(sqlalchemy.create_engine(url), directory.name)
 
 
 def _open_storage(url: str) -> optuna.storages.RDBStorage:
-    """Open a database, patiently: another process may be writing."""
-    engine = {"connect_args": {"timeout": _LOCK_SECONDS}} if url.startswith("sqlite") else None
-    for attempt in range(3):
-        try:
+    """Open a database, patiently: that of a server may just be made for another study."""
+    engine: dict[str, Any] = {"pool_pre_ping": True}  # a server may have dropped a connection
+    if url.startswith("sqlite"):
+        engine = {"connect_args": {"timeout": _LOCK_SECONDS}}
+    for _ in range(_ATTEMPTS - 1):
+        with contextlib.suppress(Exception):
             return optuna.storages.RDBStorage(url, engine_kwargs=engine)
-        except Exception as error:
-            if attempt == 2:
-                first_line = str(error).strip().partition("\n")[0]
-                raise ScilabRLError(
-                    f"The study's database {url} cannot be opened: {first_line}. "
-                    "Give another hydra.sweeper.storage, or another study_name."
-                ) from error
-            time.sleep(0.5)
-    raise AssertionError("unreachable")
+        time.sleep(0.5)
+    with _explained(url):
+        return optuna.storages.RDBStorage(url, engine_kwargs=engine)
+
+
+@contextlib.contextmanager
+def _explained(url: str) -> Iterator[None]:
+    """Say in one line why a database cannot be opened, without its password."""
+    try:
+        yield
+    except ImportError as error:
+        package, extra = ("PyMySQL", "mysql") if url.startswith("m") else ("psycopg", "postgres")
+        raise MissingDependencyError(package, extra, f"for {url.partition(':')[0]}") from error
+    except Exception as error:
+        first_line = str(error).strip().partition("\n")[0]
+        address = re.sub(r":[^:/@]*@", ":***@", url)
+        raise ScilabRLError(
+            f"The study's database {address} cannot be opened: {first_line}. "
+            "Give another hydra.sweeper.storage, or another study_name."
+        ) from error

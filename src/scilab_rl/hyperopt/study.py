@@ -117,7 +117,7 @@ class Study:
         if self.settings.max_duration_minutes is not None:
             self.stop.deadline = time.monotonic() + 60 * self.settings.max_duration_minutes
         with self.ledger.locked():
-            self.ledger.hold_lease()
+            self.ledger.sign()
             self.ledger.allow_running()
         try:
             while self._assign() and not self.stop.at_once:
@@ -128,7 +128,7 @@ class Study:
                     self.observer.update(self.runs)
         finally:
             self._give_up_running()
-            self.ledger.release_lease()
+            self.ledger.withdraw()
 
     def interrupt(self, number: int) -> None:
         """Let the running trials end at the first signal; end them at the second."""

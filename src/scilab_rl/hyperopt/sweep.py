@@ -212,9 +212,10 @@ def _define(
     }
     with ledger.locked():
         old = ledger.definition()
+        if not (ledger.directory / DEFINITION_FILE).exists():
+            _save_configuration(ledger.directory, cfg, settings)  # each machine has its folder
         if old is None:
             ledger.define(new)
-            _save_configuration(ledger.directory, cfg, settings)
             return new
         refuse_changes(old, new, settings)
         asked = settings.seed or cfg.seed

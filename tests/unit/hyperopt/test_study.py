@@ -263,10 +263,12 @@ def settings_and_scores(study) -> list[tuple]:
     return [(settings[run.trial], run.repeat, run.scores) for run in study.runs]
 
 
-def start(directory: Path, max_trials: int, n_workers: int = 2) -> subprocess.Popen:
-    numbers = map(str, (max_trials, n_workers))
+def start(
+    directory: Path, max_trials: int, n_workers: int = 2, storage: str = ""
+) -> subprocess.Popen:
+    given = map(str, (directory, max_trials, n_workers, storage))
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.unit.hyperopt.toy", str(directory), *numbers],
+        [sys.executable, "-m", "tests.unit.hyperopt.toy", *given],
         cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
         start_new_session=True,
     )  # fmt: skip

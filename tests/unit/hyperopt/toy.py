@@ -1,7 +1,7 @@
 """Studies whose runs are made of a formula: real processes, real storage, no training.
 
 As a script, it runs one study and prints why it ended: ``python -m tests.unit.hyperopt.toy FOLDER
-MAX_TRIALS WORKERS``.
+MAX_TRIALS WORKERS DATABASE``.
 """
 
 from __future__ import annotations
@@ -66,6 +66,9 @@ def definition(space: SearchSpace, settings: Any) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    folder, trials, workers = sys.argv[1:]
-    done = run(Path(folder), "seconds=0.2", max_trials=int(trials), n_workers=int(workers))
+    folder, trials, workers, url = sys.argv[1:]
+    done = run(
+        Path(folder), "seconds=0.2", max_trials=int(trials), n_workers=int(workers),
+        storage=url or None,
+    )  # fmt: skip
     sys.stdout.write(f"{done.stop.reason or 'finished'}\n")
