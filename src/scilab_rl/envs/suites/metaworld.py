@@ -32,16 +32,23 @@ class GoalTask:
     Attributes:
         threshold: Distance up to which the goal counts as reached, in m.
         axes: The axes on which the distance is measured.
-        part: What is brought there: ``object`` or ``gripper``.
+        part: What is brought there: ``object``, ``gripper`` or the name of a site.
+        offset: Added to its place, in m.
+        scale: How much each axis counts; goals are in these units.
+        height: Height of the goal, where it is not that of Meta-World's target, in m.
     """
 
     threshold: float
     axes: tuple[int, ...] = _ALL
     part: str = "object"
+    offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    scale: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    height: float | None = None
 
 
 # One row per task whose success is a distance between a place in the observation and the target.
 GOAL_TASKS = {
+    "basketball": GoalTask(0.08, scale=(1.0, 1.0, 2.0), height=0.3),
     "bin-picking": GoalTask(0.05),
     "box-close": GoalTask(0.08),
     "button-press": GoalTask(0.02, _Y),
@@ -59,11 +66,13 @@ GOAL_TASKS = {
     "drawer-close": GoalTask(0.065),
     "drawer-open": GoalTask(0.03, _Y),
     "faucet-close": GoalTask(0.07),
+    "faucet-open": GoalTask(0.07, offset=(-0.04, 0.0, 0.03)),
     "hand-insert": GoalTask(0.05),
     "handle-press": GoalTask(0.02, _Z),
     "handle-press-side": GoalTask(0.02, _Z),
     "handle-pull": GoalTask(0.05, _Z),
     "handle-pull-side": GoalTask(0.08),
+    "peg-insert-side": GoalTask(0.07, part="pegHead", scale=(1.0, 2.0, 2.0)),
     "peg-unplug-side": GoalTask(0.07),
     "pick-out-of-hole": GoalTask(0.07),
     "pick-place": GoalTask(0.07),
@@ -83,6 +92,15 @@ GOAL_TASKS = {
     "sweep-into": GoalTask(0.05, (0, 1)),
     "window-close": GoalTask(0.05, _X),
     "window-open": GoalTask(0.05, _X),
+}
+# The others, and why HER has no goals to work with there.
+WITHOUT_GOALS = {
+    "assembly": "two bounds, for alignment and for height, not one distance",
+    "disassemble": "a height to rise above, at any place",
+    "hammer": "the nail has to be in, always by the same amount",
+    "lever-pull": "the lever has to be upright, always at the same angle",
+    "stick-pull": "the stick must also be inserted",
+    "stick-push": "the stick must also be held",
 }
 
 
@@ -201,18 +219,22 @@ class MetaWorldGoal(MetaWorld):
         return type(self), (self.task, self.reward_type, self.render_mode)
 
     def _with_goals(self, vector: np.ndarray) -> dict[str, np.ndarray]:
-        axes = list(self.goal_task.axes)
-        target = np.asarray(self.inner._target_pos)
+        row = self.goal_task
+        axes, scale = list(row.axes), np.asarray(row.scale)
+        target = np.array(self.inner._target_pos)
+        if row.height is not None:
+            target[2] = row.height
         return {
             "observation": vector,
-            "achieved_goal": self._place(vector)[axes],
-            "desired_goal": target[axes],
+            "achieved_goal": ((self._place(vector) + row.offset) * scale)[axes],
+            "desired_goal": (target * scale)[axes],
         }
 
     def _place(self, vector: np.ndarray) -> np.ndarray:
-        if self.goal_task.part == "gripper":
+        part = self.goal_task.part
+        if part == "gripper":
             return self.inner.tcp_center
-        return vector[4:7]
+        return vector[4:7] if part == "object" else self.inner._get_site_pos(part)
 
     def _is_success(self, observation: dict[str, np.ndarray]) -> bool:
         difference = observation["achieved_goal"] - observation["desired_goal"]

@@ -4,13 +4,20 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from scilab_rl.envs.registration import resolve_env_id
+from scilab_rl.envs.registration import known_env_ids, resolve_env_id
 from scilab_rl.testing.goal_environments import EnvironmentContract
 
 pytest.importorskip("metaworld")
 
-# One of each kind of row: object, gripper, one axis, two axes.
-KINDS = ("drawer-close", "reach", "door-unlock", "pick-place", "sweep-into")
+from metaworld.env_dict import ALL_V3_ENVIRONMENTS
+
+from scilab_rl.envs.suites.metaworld import GOAL_TASKS, WITHOUT_GOALS
+
+# One of each kind of row: object, gripper, one axis, two axes, site and scale, offset, height.
+KINDS = (
+    "drawer-close", "reach", "door-unlock", "pick-place", "sweep-into", "peg-insert-side",
+    "faucet-open", "basketball",
+)  # fmt: skip
 
 
 @pytest.mark.slow
@@ -30,6 +37,28 @@ def test_success_is_that_of_metaworld_when_its_expert_acts(task) -> None:
         successes.append(info["is_success"])
     assert any(successes)
     assert not all(successes)
+
+
+def test_each_task_is_there_as_it_is_and_with_goals_or_with_a_reason_why_not() -> None:
+    known_env_ids()
+    tasks = {name.removesuffix("-v3") for name in ALL_V3_ENVIRONMENTS}
+    assert len(tasks) == 50
+    assert {*GOAL_TASKS} | {*WITHOUT_GOALS} == tasks
+    assert len(GOAL_TASKS) == 44
+    assert all(f"MetaW-{task}-v3" in gym.registry for task in tasks)
+    assert all(f"MetaW-{task}-sparse-v3" in gym.registry for task in GOAL_TASKS)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("task", sorted(name[:-3] for name in ALL_V3_ENVIRONMENTS))
+def test_all_tasks_draw_a_new_goal_or_place_at_each_reset(task) -> None:
+    env = gym.make(resolve_env_id(f"MetaW-{task}")[0])
+    firsts = [env.reset(seed=0)[0]] + [env.reset()[0] for _ in range(3)]
+    assert len({first.tobytes() for first in firsts}) == 4
+    observation, reward, *_ = env.step(env.action_space.sample())
+    assert observation.shape == (39,)
+    assert np.isfinite(reward)
+    env.close()
 
 
 def test_goals_are_drawn_and_observed() -> None:
