@@ -7,8 +7,11 @@ Prints one JSON object with
 * ``shown_frames_per_second``: shown FetchPush steps per second at 480x480 with 4 probes, drawing,
   probes and hand-over to the encoder included (bar: at least 20), beside
   ``bare_frames_per_second``, the same environment drawn without us;
-* ``stuck_viewer_speed``: speed of shown training with a stopped viewer process, relative to a
-  running one (bar: at least 0.95).
+* ``running_viewer`` and ``stuck_viewer``: speed of shown training with a viewer that reads, or with
+  one that has stopped reading until all buffers were full, relative to the same training whose
+  scenes nobody takes (bar: at least 0.95). Windows of one episode follow each other in the order
+  A B B A within one run, so that slow changes of the machine's load cancel; ``interval`` holds 95 %
+  of the bootstrapped medians. There are no updates in them, which would hide the viewer's share.
 
 Run: python benchmarks/showing.py
 """
@@ -23,17 +26,23 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from subprocess import DEVNULL, Popen
 from typing import Any
 
 import hydra
+import numpy as np
 
 from scilab_rl import assembly, config, experiment
 from scilab_rl.results import RunDirectory
+from scilab_rl.visualization.live import LOOPBACK, LiveViewer, free_port, start_viewer
+from scilab_rl.visualization.records import ClipInfo, Record, encode_picture
 from scilab_rl.workspace import open_desk
 
 FOUR = "render_metrics_test=[q_value,critic_variance,goal_distance,reward]"
 FOUR_TRAIN = "render_metrics_train=[q_value,critic_variance,goal_distance,reward]"
-REPEATS, STUCK_REPEATS, STUCK_STEPS = 3, 6, 400
+REPEATS = 3
+EPISODE = 50  # steps of an episode of Fetch
+N_PAIRS = 12  # of windows, per viewer
 
 
 def main() -> None:
@@ -44,7 +53,8 @@ def main() -> None:
             "unwatched_share": unwatched_share(),
             "bare_frames_per_second": bare_frames_per_second(),
             "shown_frames_per_second": shown_frames_per_second(),
-            "stuck_viewer_speed": stuck_viewer_speed(),
+            "running_viewer": speed_with_viewer(stuck=False),
+            "stuck_viewer": speed_with_viewer(stuck=True),
             "load_average": os.getloadavg()[0],
         }
     sys.stdout.write(json.dumps(result, indent=2) + "\n")
@@ -105,22 +115,110 @@ def shown_frames_per_second() -> float:
     return statistics.median(rates)
 
 
-def stuck_viewer_speed() -> float:
-    """Return the speed of shown training with a stopped viewer, relative to a running one."""
-    speeds: dict[bool, list[float]] = {False: [], True: []}
-    for stuck in [False, True] * STUCK_REPEATS:
-        session = make_session("env=FetchReach", "render=display", FOUR_TRAIN)
-        viewer = session.showing.sinks[0]
-        if stuck and viewer._child is not None:
-            os.kill(viewer._child.pid, signal.SIGSTOP)
-        session.showing.train.show(1, STUCK_STEPS // 50)
-        started = time.perf_counter()
-        session.algorithm.learn(STUCK_STEPS, callback=session.trainer)
-        speeds[stuck].append(STUCK_STEPS / (time.perf_counter() - started))
-        if stuck and viewer._child is not None:
-            os.kill(viewer._child.pid, signal.SIGCONT)
-        close(session)
-    return statistics.median(speeds[True]) / statistics.median(speeds[False])
+def speed_with_viewer(*, stuck: bool) -> dict[str, Any]:
+    """Compare shown training with a viewer to the same whose scenes nobody takes."""
+    session = make_session(
+        "env=FetchReach", "render=display", FOUR_TRAIN, "eval_after_n_steps=1000000"
+    )
+    session.algorithm.learning_starts = 10**9
+    viewer = session.showing.sinks[0]
+    reader = connect_reader(viewer)
+    if stuck:
+        os.kill(reader.pid, signal.SIGSTOP)
+        fill_buffers(viewer)
+    windows = Windows(session.showing.train, viewer, wait=not stuck)
+    session.trainer.after_step.append(windows.after_step)
+    session.showing.train.show(1, 10**9)
+    session.algorithm.learn((2 * N_PAIRS + 1) * EPISODE, callback=session.trainer)
+    reader.kill()
+    reader.wait()
+    close(session)
+    return windows.result() | {"dropped_pictures": viewer.n_dropped_pictures}
+
+
+def connect_reader(viewer: LiveViewer) -> Popen[bytes]:
+    """Start a program that reads what the viewer serves, as a window or a browser does."""
+    own_port = str(free_port(viewer.data_port + 1))
+    reader = start_viewer(
+        [viewer.uri, "--serve-grpc", "--bind", LOOPBACK, "--port", own_port], DEVNULL
+    )
+    time.sleep(2.0)
+    return reader
+
+
+def fill_buffers(viewer: LiveViewer) -> None:
+    """Send scenes until the viewer takes no more."""
+    noise = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
+    scene = Record("train", 0, 0, 1, 0, encode_picture(noise), None)
+    viewer.begin(ClipInfo("noise", "train", 1, "noise", "noise", 25.0, ()))
+    while not viewer.n_dropped_pictures:
+        viewer.add(scene)
+        time.sleep(0.005)
+
+
+class Windows:
+    """Times episodes while a viewer and nobody take turns in the order A B B A.
+
+    Args:
+        timeline: What makes the scenes.
+        viewer: Takes them in every other window.
+        wait: Whether the viewer shall have finished before the next window.
+    """
+
+    def __init__(self, timeline: Any, viewer: Any, *, wait: bool) -> None:
+        self.timeline = timeline
+        self.takers = {False: _Nobody(), True: viewer}
+        self.viewer = viewer
+        self.wait = wait
+        self.seconds: dict[bool, list[tuple[float, float]]] = {False: [], True: []}
+        self._n_steps = 0
+        self._order = [False, *[False, True, True, False] * (N_PAIRS // 2), False]
+        self._started = (0.0, 0.0)
+
+    def after_step(self) -> None:
+        """Count; between two episodes change the taker."""
+        self._n_steps += 1
+        window, step = divmod(self._n_steps, EPISODE)
+        if step:
+            return
+        wall, cpu = self._started
+        if window > 1:  # the first one warms up
+            times = (time.perf_counter() - wall, time.process_time() - cpu)
+            self.seconds[self._order[window - 1]].append(times)
+        while self.wait and self.viewer.n_waiting:
+            time.sleep(0.01)
+        self.timeline.sinks = [self.takers[self._order[window]]]
+        self._started = (time.perf_counter(), time.process_time())
+
+    def result(self) -> dict[str, Any]:
+        """Return relative speeds, by wall clock and by processor time."""
+        without, with_viewer = (np.array(self.seconds[taken]) for taken in (False, True))
+        ratios = without / with_viewer
+        drawn = np.random.default_rng(0).integers(0, len(ratios), (10_000, len(ratios)))
+        low, high = np.percentile(np.median(ratios[drawn], axis=1), [2.5, 97.5], axis=0)
+        wall, cpu = np.median(ratios, axis=0)
+        return {
+            "speed": wall,
+            "interval": [low[0], high[0]],
+            "speed_by_processor_time": cpu,
+            "interval_by_processor_time": [low[1], high[1]],
+            "steps_per_second": EPISODE / float(np.median(with_viewer[:, 0])),
+            "steps_per_second_nobody": EPISODE / float(np.median(without[:, 0])),
+            "pairs": len(ratios),
+        }
+
+
+class _Nobody:
+    """Takes scenes and does nothing."""
+
+    def begin(self, clip: Any) -> None:
+        pass
+
+    def add(self, record: Any) -> None:
+        pass
+
+    def end(self) -> None:
+        pass
 
 
 def make_session(*overrides: str) -> Any:

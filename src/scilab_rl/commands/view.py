@@ -17,10 +17,10 @@ from scilab_rl.visualization.archive import FOLDER, SUFFIX
 from scilab_rl.visualization.live import (
     LOOPBACK,
     PAGE_PORT,
+    Window,
     free_port,
     has_display,
     ssh_line,
-    start_viewer,
 )
 
 _log = logging.getLogger(__name__)
@@ -82,8 +82,10 @@ def show(recording: Path, *, in_browser: bool) -> None:
     viewer_file, page = recording.with_suffix(".rrd"), recording.with_suffix(".html")
     has_viewer = viewer_file.is_file() and importlib.util.find_spec("rerun_cli") is not None
     if has_display() and has_viewer and not in_browser:
-        start_viewer([str(viewer_file)]).wait()
-        return
+        reason = Window(str(viewer_file)).wait()
+        if reason is None:
+            return
+        _log.warning("No window can be opened (%s). The page shows it too:", reason)
     _log.info("%s", page)
     if not page.is_file():
         raise ConfigError(f"'{page}' does not exist. `scilab-rl probe` makes it again.")

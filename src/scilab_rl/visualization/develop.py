@@ -25,6 +25,7 @@ _WRITERS: dict[str, Callable[[Clip, Path], None]] = {
     ".rrd": write_viewer_file,
 }
 _POLITE = 10
+_PATIENCE = 600  # seconds
 
 
 def develop(recording: Path) -> list[Path]:
@@ -39,14 +40,18 @@ def develop(recording: Path) -> list[Path]:
     Raises:
         RuntimeError: If one of them could not be written, with the reason in one line.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", __name__, str(recording)],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        start_new_session=True,  # Ctrl-C ends the training, the last episode is still written
-    )
+    try:
+        done = subprocess.run(
+            [sys.executable, "-m", __name__, str(recording)],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            text=True,
+            check=False,
+            timeout=_PATIENCE,
+            start_new_session=True,  # Ctrl-C ends the training, the last episode is still written
+        )
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError(f"video and page were not ready after {_PATIENCE} s") from error
     if done.returncode:
         lines = done.stderr.strip().splitlines() or [f"exit code {done.returncode}"]
         raise RuntimeError(lines[-1])
@@ -69,13 +74,17 @@ def main(arguments: Sequence[str]) -> int:
         for suffix, write in _WRITERS.items():
             if suffix == ".rrd" and importlib.util.find_spec("rerun") is None:
                 continue  # the viewer is optional
+            path = recording.with_suffix(suffix)
             try:
-                write(clip, recording.with_suffix(suffix))
+                write(clip, path)
             except Exception as error:  # noqa: BLE001 - the other files can still be made
+                path.unlink(missing_ok=True)  # a part of it would look like the whole
                 failures.append(f"{suffix} could not be written: {error}")
     sys.stderr.write("; ".join(" ".join(failure.split()) for failure in failures))
     return int(bool(failures))
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    exit_code = main(sys.argv[1:])
+    sys.stderr.flush()
+    os._exit(exit_code)  # on a full disk, the viewer's package would wait for ever

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import html
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -15,6 +16,7 @@ from scilab_rl.metrics.triggers import Trigger
 from scilab_rl.visualization.recorder import ClipRecorder
 from scilab_rl.visualization.records import Clip, ClipInfo, Record, media_type
 
+_log = logging.getLogger(__name__)
 SECONDS_AROUND = 2.0
 MOST_MOMENTS = 60  # in the gallery; the others stay in their folder
 GALLERY = "gallery.html"
@@ -81,8 +83,12 @@ class MomentRecorder:
     def close(self) -> None:
         """Write the gallery."""
         self.recorder.close()
-        if self.moments:
+        if not self.moments:
+            return
+        try:
             self._write_gallery()
+        except OSError as error:
+            _log.warning("The gallery could not be written: %s.", error)
 
     def _peaks(self, clip: Clip, around: int) -> list[tuple[int, float]]:
         """Return the best scene of each moment; those in its neighbourhood belong to it."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import dataclasses
 import getpass
 import importlib.util
 import json
@@ -18,7 +19,7 @@ import tempfile
 import threading
 import urllib.parse
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from scilab_rl.errors import ConfigError
 from scilab_rl.visualization.records import ClipInfo, Record
@@ -34,6 +35,7 @@ LOOPBACK = "127.0.0.1"
 DATA_PORT, PAGE_PORT = 9876, 9090
 _N_PORTS = 50
 _WAITING_PICTURES = 64  # beyond that, pictures are dropped, numbers never
+_PATIENCE = 2.0  # seconds for what is waiting at the end
 _MEMORY = "512MiB"  # of the server; the oldest scenes go first
 _STOP = object()
 
@@ -55,37 +57,64 @@ class LiveViewer:
             _log.warning(
                 "The live view listens on %s: everybody who can reach this machine can look.", host
             )
+        self._rerun = rerun
         self._recording = rerun.RecordingStream(APPLICATION)
         self.data_port = free_port(DATA_PORT, host)
         sink = rerun.GrpcServerSink(bind_ip=host, port=self.data_port, server_memory_limit=_MEMORY)
         self._recording.set_sinks(sink, default_blueprint=layout(panels))
+        self.uri, self._host = sink.uri, host
         self.address: str | None = None
         self.n_dropped_pictures = 0
-        self._child = self._open_viewer(sink.uri, host, has_display() if window is None else window)
+        self._page: subprocess.Popen[bytes] | None = None
+        self._is_closing = threading.Event()
+        if has_display() if window is None else window:
+            self._open_window()
+        else:
+            self._open_page()
         self._queue: queue.SimpleQueue[Any] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._work, name="live view", daemon=True)
         self._thread.start()
         atexit.register(self.close)
+
+    @property
+    def n_waiting(self) -> int:
+        """How many scenes have not been passed on yet."""
+        return self._queue.qsize()
 
     def begin(self, clip: ClipInfo) -> None:
         """Begin a clip."""
         self._queue.put(clip)
 
     def add(self, record: Record) -> None:
-        """Pass on a scene; its picture is dropped when too many are waiting."""
-        with_picture = self._queue.qsize() < _WAITING_PICTURES
-        self.n_dropped_pictures += not with_picture
-        self._queue.put((record, with_picture))
+        """Pass on a scene; only its numbers when too many pictures are waiting."""
+        if self.n_waiting >= _WAITING_PICTURES:
+            if not self.n_dropped_pictures:
+                _log.warning(
+                    "The viewer does not keep up: until it does, pictures are left out, numbers "
+                    "are not. Training goes on."
+                )
+            self.n_dropped_pictures += 1
+            record = dataclasses.replace(record, picture=b"", observation=None, state=None)
+        self._queue.put(record)
 
     def end(self) -> None:
         """Finish a clip."""
 
     def close(self) -> None:
-        """End the viewer's server; what is still waiting gets two seconds."""
+        """End the servers; what is still waiting gets two seconds. A window stays open."""
+        if self._is_closing.is_set():
+            return
+        self._is_closing.set()
         atexit.unregister(self.close)
         self._queue.put(_STOP)
-        self._thread.join(2.0)
-        _end_child(self._child)
+        self._thread.join(_PATIENCE)
+        if self._thread.is_alive():  # the viewer is stuck, and the package would wait for it
+            atexit.unregister(self._rerun.rerun_shutdown)
+        _end_child(self._page)
+        _log.info(
+            "The live view has ended; a window or page that is open keeps what it has shown. "
+            "To keep episodes in files: render=record, or scilab-rl play last --record."
+        )
 
     def _work(self) -> None:
         stream = ViewerStream(self._recording)
@@ -94,23 +123,55 @@ class LiveViewer:
                 if isinstance(item, ClipInfo):
                     stream.begin(item)
                 else:
-                    record, with_picture = item
-                    stream.add(record, with_picture=with_picture)
+                    stream.add(item)
             except Exception as error:  # noqa: BLE001 - showing must not end the training
                 _log.warning("The live view has ended: %s. Training goes on.", error)
                 return
 
-    def _open_viewer(self, uri: str, host: str, window: bool) -> subprocess.Popen[bytes] | None:
-        if window:
-            _log.info("Live view: in a window; the data are served at %s.", uri)
-            return start_viewer([uri, "--port", "0"])
-        page_port = free_port(PAGE_PORT, host, avoid=self.data_port)
-        child = serve_page(uri, host, page_port)
-        self.address = page_address(uri, host, page_port)
+    def _open_page(self) -> None:
+        page_port = free_port(PAGE_PORT, self._host, avoid=self.data_port)
+        self._page = serve_page(self.uri, self._host, page_port)
+        self.address = page_address(self.uri, self._host, page_port)
         _log.info("Live view: %s", self.address)
-        if host == LOOPBACK:
+        if self._host == LOOPBACK:
             _log.info("%s", ssh_line(page_port, self.data_port))
-        return child
+
+    def _open_window(self) -> None:
+        window = Window(self.uri)
+        _log.info("Live view: in a window; the data are served at %s.", self.uri)
+        watching = threading.Thread(target=self._watch, args=(window,), name="window", daemon=True)
+        watching.start()
+
+    def _watch(self, window: Window) -> None:
+        """Wait for the end of a window; one that fails is replaced by the page."""
+        reason = window.wait()
+        if reason is not None and not self._is_closing.is_set():
+            _log.warning("No window can be opened (%s). The browser shows it too:", reason)
+            self._open_page()
+
+
+class Window:
+    """The viewer in a window of its own; it belongs to the user and outlives us.
+
+    It listens, too, but to this machine only.
+
+    Args:
+        source: Address of a data server, or path of a recording.
+    """
+
+    def __init__(self, source: str) -> None:
+        self._said = tempfile.TemporaryFile()
+        self.process = start_viewer([source, "--bind", LOOPBACK, "--port", "0"], self._said)
+
+    def wait(self) -> str | None:
+        """Wait until it is closed; return why it failed, or None if it did not."""
+        self.process.wait()
+        with self._said as said:
+            said.seek(0)
+            lines = said.read().decode(errors="replace").strip().splitlines()
+        if not self.process.returncode:
+            return None
+        return lines[-1] if lines else f"exit code {self.process.returncode}"
 
 
 def serve_page(source: str, host: str, page_port: int) -> subprocess.Popen[bytes]:
@@ -122,7 +183,7 @@ def serve_page(source: str, host: str, page_port: int) -> subprocess.Popen[bytes
         page_port: Port of the page.
     """
     options = ["--serve-web", "--bind", host, "--web-viewer-port", str(page_port)]
-    return start_viewer([source, *options, "--port", "0"])
+    return start_viewer([source, *options, "--port", "0"], subprocess.DEVNULL)
 
 
 def page_address(uri: str, host: str, page_port: int) -> str:
@@ -134,17 +195,6 @@ def ssh_line(*ports: int) -> str:
     """Return the command that makes ports of this machine those of another one."""
     forwards = " ".join(f"-L {port}:{LOOPBACK}:{port}" for port in ports)
     return f"From another machine first: ssh {forwards} {getpass.getuser()}@{socket.gethostname()}"
-
-
-def start_viewer(arguments: list[str]) -> subprocess.Popen[bytes]:
-    """Start the viewer's program, with its collection of usage data switched off."""
-    return subprocess.Popen(
-        [str(_program()), *arguments],
-        env=os.environ | {"XDG_CONFIG_HOME": _quiet_configuration()},
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
 
 
 def free_port(first: int, host: str = LOOPBACK, *, avoid: int = -1) -> int:
@@ -170,6 +220,18 @@ def has_display() -> bool:
     if sys.platform in ("darwin", "win32"):
         return "SSH_CONNECTION" not in os.environ
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def start_viewer(arguments: list[str], stderr: int | IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start the viewer's program, with its collection of usage data switched off."""
+    return subprocess.Popen(
+        [str(_program()), *arguments],
+        env=os.environ | {"XDG_CONFIG_HOME": _quiet_configuration()},
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=stderr,
+        start_new_session=True,  # Ctrl-C is for the training
+    )
 
 
 def _program() -> Path:

@@ -26,14 +26,22 @@ PHASES = {"train": "training", "eval": "evaluation"}
 
 
 def write_movie(clip: Clip, path: Path) -> None:
-    """Write a clip as mp4."""
-    writer = VideoWriter(path, clip.info.fps)
+    """Write a clip as mp4.
+
+    Raises:
+        OSError: If not all frames are in the file, for example because the disk is full.
+    """
+    import imageio_ffmpeg
+
+    writer, frames = VideoWriter(path, clip.info.fps), MovieFrames(clip)
     try:
-        frames = MovieFrames(clip)
         for index in range(len(frames)):
             writer.add(frames[index])
     finally:
         writer.close()
+    n_written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the encoder hides failures
+    if n_written != len(frames):
+        raise OSError(f"{n_written} of {len(frames)} frames could be written; is the disk full?")
 
 
 class MovieFrames:

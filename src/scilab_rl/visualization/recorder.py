@@ -28,6 +28,7 @@ class ClipRecorder:
         self.folder = folder
         self.on_file = on_file
         self.recordings: list[Path] = []
+        self._has_warned = False
         self._clip: Clip | None = None
         self._finished: queue.SimpleQueue[Clip | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
@@ -67,7 +68,17 @@ class ClipRecorder:
             try:
                 self._write(clip)
             except (OSError, RuntimeError) as error:
-                _log.warning("Recording %s: %s. Training goes on.", clip.info.name, error)
+                self._warn_once(clip.info.name, error)
+
+    def _warn_once(self, name: str, error: Exception) -> None:
+        """Say what is wrong with a recording; what comes later has most likely the same cause."""
+        if not self._has_warned:
+            self._has_warned = True
+            _log.warning(
+                "Recording %s: %s. Training goes on; further failures of this kind are not told.",
+                name,
+                error,
+            )
 
     def _write(self, clip: Clip) -> None:
         self.folder.mkdir(parents=True, exist_ok=True)

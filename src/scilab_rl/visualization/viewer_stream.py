@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Iterable
 from pathlib import Path
@@ -14,6 +15,8 @@ from scilab_rl.visualization.records import Clip, ClipInfo, Record, label_of, me
 APPLICATION = "scilab-rl"
 PHASES = {"train": "training", "eval": "evaluation"}
 _GAP = float("nan")
+_PATIENCE = 60.0  # seconds for writing a file
+_WHAT_IT_SAYS = "warn,re_quota_channel=error"  # that a viewer is slow is told once, by us
 
 
 def import_rerun(purpose: str) -> Any:
@@ -22,6 +25,7 @@ def import_rerun(purpose: str) -> Any:
     Raises:
         MissingDependencyError: If it is not installed.
     """
+    os.environ.setdefault("RUST_LOG", _WHAT_IT_SAYS)
     try:
         import rerun
     except ImportError as error:
@@ -53,21 +57,18 @@ class ViewerStream:
         self._info = info
         self._curves |= {panel: [] for panel in info.panels if panel not in self._curves}
 
-    def add(
-        self, record: Record, seconds: float | None = None, *, with_picture: bool = True
-    ) -> None:
+    def add(self, record: Record, seconds: float | None = None) -> None:
         """Write a scene.
 
         Args:
-            record: The scene.
+            record: The scene; without a picture, its numbers.
             seconds: When it was, since 1970; None: now.
-            with_picture: False keeps the numbers and drops the picture.
         """
         seconds = time.time() if seconds is None else seconds
         if record.step == 0 and self._n_scenes:
             self._leave_gap(record, seconds)
         self._set_times(record, seconds)
-        if with_picture:
+        if record.picture:
             picture = self.rerun.EncodedImage(
                 contents=record.picture, media_type=media_type(record.picture)
             )
@@ -158,7 +159,7 @@ def write_viewer_file(clip: Clip, path: Path) -> None:
     stream.begin(clip.info)
     for index, record in enumerate(clip.records):
         stream.add(record, seconds=index / clip.info.fps)
-    recording.flush()
+    recording.flush(timeout_sec=_PATIENCE)
     recording.disconnect()
 
 

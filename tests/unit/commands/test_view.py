@@ -60,15 +60,15 @@ def test_window_page_or_server(
     pytest.importorskip("rerun")
     opened: list[tuple[str, str]] = []
 
-    class Child:
-        def __init__(self, arguments: list[str]) -> None:
-            opened.append(("window", arguments[0]))
+    class Window:
+        def __init__(self, source: str) -> None:
+            opened.append(("window", source))
 
         def wait(self) -> None:
             pass
 
     monkeypatch.setattr(view, "has_display", lambda: has_display)
-    monkeypatch.setattr(view, "start_viewer", Child)
+    monkeypatch.setattr(view, "Window", Window)
     monkeypatch.setattr(view, "_serve", lambda page: opened.append(("served", str(page))))
     monkeypatch.setattr("webbrowser.open", lambda uri: opened.append(("page", uri)) or True)
     view.show(run / "episodes" / "play_001.npz", in_browser=in_browser)

@@ -61,42 +61,42 @@ def wait_for_page(viewer: LiveViewer) -> None:
 def test_page_is_served_to_this_machine_only(viewer: LiveViewer) -> None:
     wait_for_page(viewer)
     show(viewer, 2)
-    assert viewer._child is not None
-    child = psutil.Process(viewer._child.pid)
+    assert viewer._page is not None
+    child = psutil.Process(viewer._page.pid)
     assert listening_addresses(psutil.Process(), child) == {"127.0.0.1"}
 
 
 def test_child_ends_with_the_view() -> None:
     viewer = LiveViewer(("reward",), window=False)
-    assert viewer._child is not None
-    pid = viewer._child.pid
+    assert viewer._page is not None
+    pid = viewer._page.pid
     assert psutil.pid_exists(pid)
     viewer.close()
     assert not psutil.pid_exists(pid)
 
 
-def test_stopped_and_killed_viewers_stop_nobody(viewer: LiveViewer) -> None:
+def test_stopped_and_killed_pages_stop_nobody(viewer: LiveViewer) -> None:
     wait_for_page(viewer)
-    assert viewer._child is not None
-    os.kill(viewer._child.pid, signal.SIGSTOP)
+    assert viewer._page is not None
+    os.kill(viewer._page.pid, signal.SIGSTOP)
     started = time.monotonic()
     show(viewer, 100)
     assert time.monotonic() - started < 2.0
-    os.kill(viewer._child.pid, signal.SIGKILL)
+    os.kill(viewer._page.pid, signal.SIGKILL)
     show(viewer, 1)
 
 
 def test_pictures_are_dropped_and_numbers_never(
-    viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch
+    viewer: LiveViewer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """While the thread hangs in the viewer, training goes on; then all numbers arrive."""
-    written: list[tuple[float | None, bool]] = []
+    written: list[Record] = []
     hanging = True
 
-    def slow_add(self: object, record: Record, *, with_picture: bool) -> None:
+    def slow_add(self: object, record: Record) -> None:
         while hanging:
             time.sleep(0.01)
-        written.append((record.reward, with_picture))
+        written.append(record)
 
     monkeypatch.setattr("scilab_rl.visualization.viewer_stream.ViewerStream.add", slow_add)
     show(viewer, 40)
@@ -105,8 +105,14 @@ def test_pictures_are_dropped_and_numbers_never(
     deadline = time.monotonic() + 10
     while len(written) < 40 * 5 and time.monotonic() < deadline:
         time.sleep(0.01)
-    assert [reward for reward, _ in written] == [0.0, 1.0, 2.0, 3.0, None] * 40
-    assert sum(not with_picture for _, with_picture in written) == viewer.n_dropped_pictures
+    assert [record.reward for record in written] == [0.0, 1.0, 2.0, 3.0, None] * 40
+    dropped = [record for record in written if not record.picture]
+    assert len(dropped) == viewer.n_dropped_pictures
+    assert all(record.observation is None for record in dropped)  # they may wait for long
+    assert [r.message for r in caplog.records if "does not keep up" in r.message] == [
+        "The viewer does not keep up: until it does, pictures are left out, numbers are not. "
+        "Training goes on."
+    ]
 
 
 def test_next_port_is_taken_when_one_is_not_free() -> None:
