@@ -126,6 +126,7 @@ def run_study(
         threshold=cfg.early_stop_threshold,
         seed=definition["seed"],
     )
+    prepare_trackers(cfg)
     from scilab_rl.hyperopt.progress import StudyProgress
 
     with (
@@ -181,6 +182,19 @@ def check_runs(request: Request, space: SearchSpace) -> DictConfig:
             example[parameter.name] = (parameter.labels or (parameter.low,))[0]
     assembly.complete(config.compose([*request.fixed, *space.overrides(example)]))
     return config.prepare(config.compose(request.fixed))
+
+
+def prepare_trackers(cfg: DictConfig) -> None:
+    """Create MLflow's database before many runs would have to wait for one of them."""
+    tracker = cfg.tracking.mlflow
+    if not config.switched_on(tracker.enabled, package="mlflow") or tracker.tracking_uri:
+        return
+    from scilab_rl.tracking import mlflow
+
+    try:
+        mlflow.prepare_database(Path(cfg.base_logdir))
+    except Exception as error:  # noqa: BLE001 - training never depends on a tracker
+        _log.warning("MLflow: %s. The study goes on without it.", error)
 
 
 def _define(

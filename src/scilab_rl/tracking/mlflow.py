@@ -26,6 +26,7 @@ _SETTINGS = {
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
     "MLFLOW_HTTP_REQUEST_TIMEOUT": "4",
 }
+_PARENT = "mlflow.parentRunId"
 _STATUS = {"failed": "FAILED", "interrupted": "KILLED"}
 
 
@@ -43,19 +44,19 @@ class MLflowTracker(Tracker):
 
     def begin(self, run: RunInfo) -> None:
         """Create the run, or go on with it after a resume."""
-        for name, value in _SETTINGS.items():
-            os.environ.setdefault(name, value)
+        _apply_settings()
         from mlflow.tracking import MlflowClient
 
-        self._client = MlflowClient(tracking_uri=self.tracking_uri or _database(run.base_logdir))
+        uri = self.tracking_uri or prepare_database(run.base_logdir)
+        self._client = MlflowClient(tracking_uri=uri)
         stored = run.run_dir / _RUN_ID_FILE
         if stored.is_file() and self._continues(stored.read_text(encoding="utf-8")):
             return
         with _locked(run.base_logdir / ".mlflow.lock"):  # two runs must not both create it
             experiment = self._experiment(run)
-        tags = {"mlflow.note.content": run.notes} | dict.fromkeys(run.tags, "true")
-        if run.group:
-            tags["group"] = run.group
+            tags = {"mlflow.note.content": run.notes} | dict.fromkeys(run.tags, "true")
+            if run.group:
+                tags |= {"group": run.group, _PARENT: self._group(experiment, run.group)}
         created = self._client.create_run(experiment, run_name=run.name, tags=tags)
         self._run_id = created.info.run_id
         stored.write_text(self._run_id, encoding="utf-8")
@@ -96,6 +97,17 @@ class MLflowTracker(Tracker):
         artifacts = (run.base_logdir.resolve() / "mlflow_artifacts").as_uri()
         return self._client.create_experiment(name, artifact_location=artifacts)
 
+    def _group(self, experiment: str, name: str) -> str:
+        """Return the id of the run below which MLflow shows the runs of a group."""
+        key = _allowed(name)
+        found = self._client.search_runs([experiment], f"tags.group_parent = '{key}'")
+        if found:
+            return found[0].info.run_id
+        tags = {"group": name, "group_parent": key}
+        parent = self._client.create_run(experiment, run_name=name, tags=tags).info.run_id
+        self._client.set_terminated(parent)
+        return parent
+
     def _log_parameters(self, run: RunInfo) -> None:
         from mlflow.entities import Param
 
@@ -107,22 +119,29 @@ class MLflowTracker(Tracker):
             self._client.log_batch(self._run_id, params=parameters[start : start + _MAX_PARAMETERS])
 
 
+def _apply_settings() -> None:
+    """Make MLflow quiet and quick; it reads these when it is imported."""
+    for name, value in _SETTINGS.items():
+        os.environ.setdefault(name, value)
+
+
 def _allowed(name: str) -> str:
     """Return the name without the characters that would make MLflow refuse the whole batch."""
     return _REFUSED_IN_NAMES.sub("_", name)
 
 
-def _database(base_logdir: Path) -> str:
-    """Return the address of the runs' database, which is created in one step.
+def prepare_database(base_logdir: Path) -> str:
+    """Return the address of the runs' database, which is created in one step when it is missing.
 
     MLflow needs seconds and many transactions for that. Two runs would collide, and a run that ends
     meanwhile would leave a database that nobody can open.
     """
-    from mlflow.tracking import MlflowClient
-
     path = base_logdir.resolve() / "mlflow.db"
     with _locked(base_logdir / ".mlflow.lock"):
         if not path.exists():
+            _apply_settings()
+            from mlflow.tracking import MlflowClient
+
             unfinished = path.with_name(".mlflow.db.tmp")
             unfinished.unlink(missing_ok=True)
             MlflowClient(tracking_uri=f"sqlite:///{unfinished}").search_experiments()

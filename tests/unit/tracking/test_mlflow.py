@@ -37,10 +37,10 @@ ONE_RUN = """
 @pytest.fixture(scope="module")
 def database(tmp_path_factory):
     """A database that MLflow itself has created; that takes seconds."""
-    from scilab_rl.tracking.mlflow import _database
+    from scilab_rl.tracking.mlflow import prepare_database
 
     base = tmp_path_factory.mktemp("data")
-    _database(base)
+    prepare_database(base)
     return base
 
 
@@ -72,6 +72,17 @@ def test_a_run_has_name_tags_and_all_parameters(started):
     assert data.params["odd_name_"] == "None"
     assert len(data.params["long"]) == 6000
     assert len(data.params) == 153
+
+
+def test_runs_of_a_group_are_shown_below_one_run(started):
+    from scilab_rl.tracking.mlflow import MLflowTracker
+
+    first, run = started
+    second = MLflowTracker()
+    second.begin(run_info(run.base_logdir, "second_of_group", group="g"))
+    parents = {stored(tracker).data.tags["mlflow.parentRunId"] for tracker in (first, second)}
+    assert len(parents) == 1
+    assert first._client.get_run(parents.pop()).info.run_name == "g"
 
 
 def test_an_epoch_is_one_batch_at_its_step(started):
