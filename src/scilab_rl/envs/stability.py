@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 
 from scilab_rl.envs.frames import simulator_state
 
 _log = logging.getLogger(__name__)
 UNSTABLE_KEY = "simulation_unstable"
+STATES_KEY = "scilab_rl.states_before_instability"
+N_STATES = 100
 # mjWARN_BADQPOS, mjWARN_BADQVEL and mjWARN_BADQACC: those after which MuJoCo resets itself.
 _RESETTING = slice(4, 7)
 
@@ -19,7 +23,8 @@ class StabilityGuard(gym.Wrapper):
     """Truncates an episode in which the simulation became unstable.
 
     Without it the robot is suddenly back at its start, in the middle of an episode, and the agent
-    learns from that.
+    learns from that. The info of such a step holds `UNSTABLE_KEY` and, under `STATES_KEY`, the
+    simulator's last states before it, at most 100, the oldest first (see `frames`).
 
     Args:
         env: An environment with MuJoCo's ``data``.
@@ -33,21 +38,25 @@ class StabilityGuard(gym.Wrapper):
         self.n_unstable = 0
         self._warnings = env.unwrapped.data.warning  # type: ignore[attr-defined]
         self._seen = 0
+        self._states: deque[Any] = deque(maxlen=N_STATES)
         _keep_warnings_out_of_the_folder()
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
         """Begin an episode."""
         result = self.env.reset(seed=seed, options=options)
         self._seen = self._count()
+        self._states.clear()
         return result
 
     def step(self, action: Any) -> Any:
         """Act, and look whether the simulation has reset itself meanwhile."""
+        self._states.append(simulator_state(self.env))  # before the step: after it, it is reset
         observation, reward, terminated, truncated, info = self.env.step(action)
         if self._count() > self._seen:
             self._seen = self._count()
             self.n_unstable += 1
-            truncated, info = True, {**info, UNSTABLE_KEY: True}
+            states = np.array(self._states)
+            truncated, info = True, {**info, UNSTABLE_KEY: True, STATES_KEY: states}
             if self.n_unstable == 1:
                 _log.warning(
                     "The simulation became unstable and MuJoCo reset it; such episodes are "

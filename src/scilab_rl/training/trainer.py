@@ -28,6 +28,7 @@ from scilab_rl.seeding import derive_seed
 from scilab_rl.tracking.base import Tracker
 from scilab_rl.training import checkpoint, foreign, resume
 from scilab_rl.training.evaluation import evaluate
+from scilab_rl.training.instability import InstabilityRecord
 from scilab_rl.training.interruption import StopRequest, TrainingInterrupted
 from scilab_rl.training.snapshot import Snapshot, capture, restore
 from scilab_rl.training.statistics import RolloutStatistics
@@ -97,6 +98,7 @@ class Trainer(BaseCallback):
         self.after_step: list[Callable[[], Any]] = []
         self.stop_request = StopRequest()
         self.statistics: RolloutStatistics | None = None
+        self.instabilities = InstabilityRecord(run_dir / "unstable")
         self._epoch_started = 0.0
         self._epoch_first_step = 0
         self._next_checkpoint = plan.save_model_freq
@@ -113,7 +115,7 @@ class Trainer(BaseCallback):
             self.trackers.episode,
             curious=mind if INTRINSIC_REWARD in mind.quantities else None,
         )
-        train_env.observers.append(self.statistics)
+        train_env.observers += [self.statistics, self.instabilities]
 
     @property
     def total_steps(self) -> int:
@@ -183,6 +185,7 @@ class Trainer(BaseCallback):
         return {
             **self.metric_logger.take(),
             **self.statistics.metrics(),
+            **self.instabilities.metrics(),
             "time/total_timesteps": float(self.num_timesteps),
             "time/fps": steps / max(seconds, 1e-9),
             "time/train_seconds": seconds,

@@ -3,11 +3,15 @@ from __future__ import annotations
 import logging
 
 import numpy as np
+from stable_baselines3.common.vec_env import DummyVecEnv
 
 from scilab_rl.envs.blocks import Blocks
 from scilab_rl.envs.examination import examine
+from scilab_rl.envs.frames import simulator_state
 from scilab_rl.envs.goal import GoalEnv
-from scilab_rl.envs.stability import UNSTABLE_KEY, StabilityGuard, guard
+from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.stability import STATES_KEY, UNSTABLE_KEY, StabilityGuard, guard
+from scilab_rl.training.instability import InstabilityRecord
 
 
 class Exploding(Blocks):
@@ -24,7 +28,7 @@ class Exploding(Blocks):
         super().apply(action)
 
 
-def test_silent_reset_ends_the_episode_and_is_counted(tmp_path, monkeypatch, caplog) -> None:
+def test_f11_silent_reset_ends_the_episode_and_is_counted(tmp_path, monkeypatch, caplog) -> None:
     monkeypatch.chdir(tmp_path)
     env = guard(Exploding())
     assert isinstance(env, StabilityGuard)
@@ -40,6 +44,33 @@ def test_silent_reset_ends_the_episode_and_is_counted(tmp_path, monkeypatch, cap
             assert env.n_unstable == n_unstable
     assert [record.message[:25] for record in caplog.records] == ["The simulation became uns"]
     assert list(tmp_path.iterdir()) == []  # no MUJOCO_LOG.TXT
+
+
+def test_f11_the_states_that_led_to_it_are_kept() -> None:
+    env = guard(Exploding())
+    for _ in range(2):  # the states of an earlier episode do not count
+        env.reset(seed=0)
+        states = []
+        for _ in range(3):
+            states.append(simulator_state(env))
+            info = env.step(np.zeros(4))[4]
+        assert np.array_equal(info[STATES_KEY], states)
+
+
+def test_f11_a_run_counts_unstable_episodes_and_writes_what_led_to_them(tmp_path) -> None:
+    record = InstabilityRecord(tmp_path / "unstable")
+    venv = ObservedVecEnv(DummyVecEnv([lambda: guard(Exploding())] * 2), "train", "Exploding")
+    venv.observers.append(record)
+    venv.seed(0)
+    venv.reset()
+    assert record.metrics() == {}
+    for _ in range(3):
+        infos = venv.step(np.zeros((2, 4)))[3]
+    assert record.metrics() == {"env/unstable_episodes": 2.0}
+    files = sorted((tmp_path / "unstable").iterdir())
+    assert [file.name for file in files] == ["step-000006-env0.npy", "step-000006-env1.npy"]
+    assert len(np.load(files[0], allow_pickle=False)) == 3
+    assert STATES_KEY not in infos[0]
 
 
 def test_other_simulators_are_left_alone() -> None:
