@@ -14,7 +14,7 @@ from scilab_rl.commands.parser import CommandParser
 from scilab_rl.commands.tables import print_json, print_rows
 from scilab_rl.errors import ConfigError, MissingDependencyError
 from scilab_rl.files import write_text
-from scilab_rl.hyperopt.folders import find_study, study_names
+from scilab_rl.hyperopt.folders import REPORT, find_study, study_names
 from scilab_rl.workspace import DESK_CONF, SHIPPED_CONF
 
 _log = logging.getLogger(__name__)
@@ -112,6 +112,11 @@ def _open_dashboard(directory: Path, port: int) -> int:
     from scilab_rl.hyperopt.ledger import stored_url
 
     command = str(Path(sys.executable).with_name("optuna-dashboard"))
-    _log.info("%s: http://127.0.0.1:%d (Ctrl-C ends it)", directory.name, port)
+    # What a sampler was told once cannot change: it holds the first repeats only.
+    _log.info(
+        "%s: http://127.0.0.1:%d (Ctrl-C ends it). It shows the mean of each setting's first "
+        "repeats; the winner of all repeats is in %s.",
+        directory.name, port, directory / REPORT,
+    )  # fmt: skip
     where = ["--host", "127.0.0.1", "--port", str(port)]
     os.execv(command, [command, stored_url(directory), *where])

@@ -141,7 +141,10 @@ def draw_parallel(summary: Summary, axes: Axes) -> bool:
     for i in reversed(range(len(rows))):  # the winner on top
         heights = [column[i] for column in columns]
         axes.plot([*heights, means[i]], color=_colour(rows[i]), alpha=0.8)
-    axes.set_xticks(range(len(names) + 1), [*(_last(name) for name in names), "score"])
+    labels = [f"{_last(name)}\n{_range(summary, name, rows)}" for name in names]
+    scores = [row.mean for row in rows if row.mean is not None]
+    labels.append(f"score\n{min(scores):.3g} … {max(scores):.3g}")
+    axes.set_xticks(range(len(names) + 1), labels)
     axes.set_yticks([0, 1], ["lowest", "highest"])
     return True
 
@@ -152,19 +155,18 @@ def draw_contour(summary: Summary, axes: Axes) -> bool:
     rows = [r for r in summary.rows if r.mean is not None and {*numeric[:2]} <= {*r.setting}]
     if len(numeric) < 2 or len(rows) < 4:
         return False
-    x, y = ([row.setting[name] for row in rows] for name in numeric[:2])
+    # Logarithms as coordinates: a triangulation of the raw values overlaps itself on log axes.
+    (x, x_label), (y, y_label) = (_coordinates(summary, name, rows) for name in numeric[:2])
     means = [row.mean or 0.0 for row in rows]
-    for name, set_scale in zip(numeric, (axes.set_xscale, axes.set_yscale), strict=False):
-        set_scale("log" if summary.definition["space"][name].get("log") else "linear")
     if len(set(x)) > 2 and len(set(y)) > 2:
         try:
             axes.tricontourf(x, y, means, levels=12, cmap="viridis", alpha=0.6)
         except (RuntimeError, ValueError):  # all points on a line
             pass
-    points = axes.scatter(x, y, c=means, cmap="viridis", edgecolors="black")
+    points = axes.scatter(x, y, c=means, cmap="viridis", edgecolors="black", clip_on=False)
     _figure(axes).colorbar(points, ax=axes, label=_score_label(summary))
-    axes.set_xlabel(_last(numeric[0]))
-    axes.set_ylabel(_last(numeric[1]))
+    axes.set_xlabel(x_label)
+    axes.set_ylabel(y_label)
     return True
 
 
@@ -210,6 +212,27 @@ def _mean_curve(runs: Sequence[Run]) -> tuple[list[int], list[float], list[float
         for column, m in zip(columns, means, strict=True)
     ]  # fmt: skip
     return list(steps), means, errors
+
+
+def _coordinates(
+    summary: Summary, name: str, rows: Sequence[SettingRow]
+) -> tuple[list[float], str]:
+    """Return a parameter's values as they are drawn, and the label of their axis."""
+    values = [float(row.setting[name]) for row in rows]
+    if summary.definition["space"][name].get("log"):
+        return [math.log10(value) for value in values], f"log10 of {_last(name)}"
+    return values, _last(name)
+
+
+def _range(summary: Summary, name: str, rows: Sequence[SettingRow]) -> str:
+    """Return the ends of a parameter's axis, as `_positions` scales it."""
+    described = summary.definition["space"][name]
+    values = [row.setting[name] for row in rows if name in row.setting]
+    if choices := described.get("choices"):
+        used = [choice for choice in choices if choice in values] or choices
+        return f"{used[0]} … {used[-1]}"
+    numbers = [float(value) for value in values] or [described["low"]]
+    return f"{min(numbers):.3g} … {max(numbers):.3g}"
 
 
 def _positions(summary: Summary, name: str, rows: Sequence[SettingRow]) -> list[float]:
