@@ -347,3 +347,17 @@ def _viewer_columns(
                 for step, cell in zip(steps, cells, strict=True):
                     values[step] = None if np.isnan(cell[0]) else float(cell[0])
     return scenes, numbers
+
+
+def test_recorded_names_are_refused_at_evaluation_and_the_probe_is_named(tmp_path: Path) -> None:
+    """Nothing is recorded while nothing is learned; the probe answers for the very step."""
+    done = run(
+        tmp_path,
+        "algorithm=cleansac",
+        "env=FetchReach",
+        "render=record",
+        "render_metrics_test=[train/critic_variance]",
+        "mlflow=0",
+    )
+    assert done.returncode == 2
+    assert done.stderr.strip().endswith("that is shown: 'critic_variance'.")

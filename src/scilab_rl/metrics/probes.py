@@ -234,6 +234,11 @@ def built_in(name: str) -> Probe:
     return Probe(name, _maker(function), _n_arguments(function), needs)
 
 
+def is_known(name: str) -> bool:
+    """Tell whether this is the name of a built-in probe."""
+    return name in _PROBES or name in _ALIASES
+
+
 def answerable(mind: Inspectable) -> list[str]:
     """Return the names of the probes that an algorithm can answer."""
     return [name for name, (_, needs) in _PROBES.items() if needs <= mind.quantities]
@@ -258,7 +263,7 @@ def resolve_metrics(
     probes: list[Probe] = []
     logged: list[str] = []
     for name in dict.fromkeys(names):
-        if name in _PROBES or name in _ALIASES:
+        if is_known(name):
             probe = built_in(name)
             _check_answerable(probe, mind, key, who)
             probes.append(probe)

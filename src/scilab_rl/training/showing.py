@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import fnmatch
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,8 +15,8 @@ from scilab_rl.algorithms.inspection import Inspection, recorded_names
 from scilab_rl.envs.frames import simulator_state
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.vectorize import observed_layer
-from scilab_rl.errors import RenderingError
-from scilab_rl.metrics.probes import ShownMetrics, resolve_metrics
+from scilab_rl.errors import ConfigError, RenderingError
+from scilab_rl.metrics.probes import ShownMetrics, answerable, is_known, resolve_metrics
 from scilab_rl.metrics.triggers import Trigger, parse_trigger
 from scilab_rl.training.timeline import RecordSink, Timeline
 from scilab_rl.training.trainer import Trainer
@@ -161,6 +162,7 @@ def make_showing(
         key="render_metrics_train",
         who=who,
     )
+    _refuse_recorded(plan.render_metrics_test, mind, recorded_names(algorithm))
     test_metrics = resolve_metrics(
         [*plan.render_metrics_test, *watched], mind, (), key="render_metrics_test", who=who
     )
@@ -234,6 +236,22 @@ def can_draw(env: VecEnv) -> bool:
 def frames_per_second(env: ObservedVecEnv) -> float:
     """Return the frame rate at which an environment's time is real time."""
     return float(env.get_attr("metadata", indices=[0])[0].get("render_fps") or DEFAULT_FPS)
+
+
+def _refuse_recorded(names: Sequence[str], mind: Inspection, recorded: Collection[str]) -> None:
+    """Refuse for evaluation what the algorithm records only while it learns; name the probe."""
+    possible = answerable(mind)
+    for name in names:
+        is_recorded = any(fnmatch.fnmatchcase(name, pattern) for pattern in recorded)
+        if not is_recorded or is_known(name):
+            continue
+        probe = name.rpartition("/")[2]
+        wanted = f"'{probe}'" if probe in possible else f"one of {', '.join(possible)}"
+        raise ConfigError(
+            f"render_metrics_test: '{name}' is recorded while the algorithm learns, and in an "
+            f"evaluation it does not learn. Use a probe, which is computed for the very step that "
+            f"is shown: {wanted}."
+        )
 
 
 def _make_sink(

@@ -1,0 +1,320 @@
+"""What goes wrong while episodes are shown or recorded, and that training goes on."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from scilab_rl.visualization.archive import load_clip
+
+from .commands import QUICK, command, last_run, quiet_environment, scilab_rl
+
+pytestmark = pytest.mark.slow
+
+PIXELS = "env=scilab_rl.testing:TinyPixels-v0"
+RECORD = ("algorithm=random", "render=record", "render_freq=1", "mlflow=0", "n_test_rollouts=1")
+# A run whose folder of recordings is a disk of its own, of the size given first.
+WITH_SMALL_DISK = """
+import shutil, subprocess, sys
+from pathlib import Path
+import hydra
+from scilab_rl import config, experiment
+from scilab_rl.workspace import open_desk
+
+kept = Path("kept")
+
+def mount(session):
+    folder = session.directory / "episodes"
+    folder.mkdir()
+    disk = ["-t", "tmpfs", "-o", f"size={sys.argv[1]}", "tmpfs", str(folder)]
+    subprocess.run(["mount", *disk], check=True)
+    close = session.showing.close
+    def close_and_keep():
+        close()
+        shutil.copytree(folder, kept)
+    session.showing.close = close_and_keep
+
+open_desk()
+with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
+    result = experiment.run(config.compose(sys.argv[2:]), watch=mount)
+print(result.status, result.steps)
+"""
+
+# A live view whose only viewer stops reading, so that all buffers fill up.
+WITH_STUCK_VIEWER = """
+import os, signal, subprocess, time
+import numpy as np
+from scilab_rl.visualization.live import LiveViewer, free_port, start_viewer
+from scilab_rl.visualization.records import ClipInfo, Record, encode_picture
+
+viewer = LiveViewer((), window=False)
+options = ["--serve-grpc", "--bind", "127.0.0.1", "--port", str(free_port(viewer.data_port + 1))]
+reader = start_viewer([viewer.uri, *options], subprocess.DEVNULL)
+time.sleep(3)
+os.kill(reader.pid, signal.SIGSTOP)
+noise = np.random.default_rng(0).integers(0, 256, (1024, 1024, 3), dtype=np.uint8)
+scene = Record("train", 0, 0, 1, 0, encode_picture(noise), None)
+viewer.begin(ClipInfo("noise", "train", 1, "noise", "noise", 25.0, ()))
+longest, began = 0.0, time.monotonic()
+while viewer.n_dropped_pictures < 500 and time.monotonic() - began < 60:
+    started = time.thread_time()
+    viewer.add(scene)
+    longest = max(longest, time.thread_time() - started)
+    time.sleep(0.002)
+print(viewer.n_dropped_pictures, longest, flush=True)
+viewer.close()
+reader.kill()
+reader.wait()
+print(time.time(), flush=True)
+"""
+
+
+def allowed_to_mount() -> bool:
+    if not shutil.which("unshare"):
+        return False
+    return subprocess.run(["unshare", "-rm", "true"], check=False).returncode == 0
+
+
+@pytest.mark.skipif(not allowed_to_mount(), reason="needs unshare -rm")
+@pytest.mark.parametrize("size", ["4k", "32k"])
+def test_f05_full_disk_ends_recording_not_training(tmp_path: Path, size: str) -> None:
+    options = [PIXELS, *RECORD, "seed=1", "n_epochs=3", "eval_after_n_steps=40"]
+    done = subprocess.run(
+        ["unshare", "-rm", sys.executable, "-c", WITH_SMALL_DISK, size, *options],
+        cwd=tmp_path,
+        env=quiet_environment(),
+        capture_output=True,
+        text=True,
+        timeout=180,
+        check=False,
+    )
+    assert done.stdout.splitlines()[-1:] == ["finished 120"], done.stderr
+    log = (last_run(tmp_path) / "train.log").read_text(encoding="utf-8")
+    warnings = [line for line in log.splitlines() if "WARNING" in line]
+    assert len(warnings) == 1, log
+    assert "Training goes on" in warnings[0]
+    for path in (tmp_path / "kept").iterdir():
+        check_whole(path)
+
+
+def check_whole(path: Path) -> None:
+    """Check that a file is what its name says, to the last scene."""
+    if path.suffix == ".npz":
+        assert len(load_clip(path).records) == 11
+    elif path.suffix == ".mp4":
+        ffmpeg = pytest.importorskip("imageio_ffmpeg")
+        assert ffmpeg.count_frames_and_secs(str(path))[0] == 11
+    elif path.suffix == ".html":
+        assert path.read_text(encoding="utf-8").rstrip().endswith("</html>")
+    else:
+        assert path.suffix == ".rrd", f"{path.name} was left behind"
+        reader = pytest.importorskip("rerun.chunk").RrdReader
+        assert list(reader(path).stream())
+
+
+@pytest.mark.filterwarnings("ignore:The ..noload:DeprecationWarning")  # MLflow's own
+def test_videos_reach_mlflow(tmp_path: Path) -> None:
+    mlflow = pytest.importorskip("mlflow")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    options = [*RECORD[:3], "mlflow=1", "n_test_rollouts=1", "n_epochs=1", "eval_after_n_steps=40"]
+    done = scilab_rl(PIXELS, *options, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    (database,) = (tmp_path / "data").glob("*.db")
+    client = mlflow.MlflowClient(f"sqlite:///{database}")
+    experiments = [experiment.experiment_id for experiment in client.search_experiments()]
+    (run,) = client.search_runs(experiments)
+    names = {artifact.path for artifact in client.list_artifacts(run.info.run_id)}
+    videos = sorted(name for name in names if name.endswith(".mp4"))
+    assert len(videos) == 2, names  # one of training, one of evaluation
+    assert {name.replace(".mp4", ".html") for name in videos} <= names
+    for video in videos:
+        copy = client.download_artifacts(run.info.run_id, video, str(tmp_path))
+        assert ffmpeg.count_frames_and_secs(copy)[0] == 11
+
+
+def test_videos_reach_wandb_offline(tmp_path: Path) -> None:
+    pytest.importorskip("wandb")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    done = scilab_rl(
+        PIXELS,
+        *RECORD,
+        "wandb=1",
+        "n_epochs=1",
+        "eval_after_n_steps=40",
+        cwd=tmp_path,
+        WANDB_MODE="offline",
+    )
+    assert done.returncode == 0, done.stderr
+    (offline,) = last_run(tmp_path).glob("wandb/offline-run-*")
+    videos = sorted((offline / "files" / "media" / "videos").rglob("*.mp4"))
+    assert len(videos) == 2
+    for video in videos:
+        assert ffmpeg.count_frames_and_secs(str(video))[0] == 11
+
+
+def test_f24_without_opengl_training_goes_on(tmp_path: Path) -> None:
+    """The back ends are hidden from the loader of libraries: what is left cannot draw."""
+    done = scilab_rl(
+        "env=FetchReach",
+        *RECORD,
+        "n_epochs=1",
+        "eval_after_n_steps=50",
+        cwd=tmp_path,
+        **without_opengl(tmp_path),
+    )
+    assert done.returncode == 0, done.stderr
+    said = [line for line in done.stderr.splitlines() if "No picture can be drawn" in line]
+    assert len(said) == 1
+    assert "apt-get install" in said[0]
+    assert json.loads((last_run(tmp_path) / "result.json").read_text())["status"] == "finished"
+
+
+def without_opengl(folder: Path) -> dict[str, str]:
+    """Return an environment in which libraries of OpenGL are found, but are none."""
+    hidden = folder / "libraries"
+    hidden.mkdir()
+    for name in ("libEGL.so.1", "libGL.so.1", "libGLdispatch.so.0", "libglapi.so.0"):
+        (hidden / name).write_bytes(b"no library")
+    return {"LD_LIBRARY_PATH": str(hidden), "DISPLAY": "", "WAYLAND_DISPLAY": ""}
+
+
+@pytest.fixture
+def display() -> Iterator[str]:
+    """A display of its own, without a screen."""
+    program = shutil.which("Xvfb")
+    if program is None:
+        pytest.skip("needs Xvfb (apt-get install -y xvfb)")
+    reading, writing = os.pipe()
+    options = ["-displayfd", str(writing), "-screen", "0", "1200x800x24", "-nolisten", "tcp"]
+    server = subprocess.Popen(
+        [program, *options],
+        pass_fds=[writing],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    )
+    os.close(writing)
+    with os.fdopen(reading) as file:
+        number = file.readline().strip()
+    assert number, "Xvfb did not start"
+    yield f":{number}"
+    server.terminate()
+    server.wait()
+
+
+def test_own_window_of_the_environment(display: str, tmp_path: Path) -> None:
+    """With render=human, the scene of the evaluation is in a window while it lasts."""
+    seen = 0
+    options = ["env=FetchReach", "algorithm=random", "render=human", "mlflow=0", "n_epochs=1"]
+    with subprocess.Popen(
+        command(*options, "eval_after_n_steps=50", "n_test_rollouts=4"),
+        cwd=tmp_path,
+        env=quiet_environment(DISPLAY=display),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+    ) as run:
+        while run.poll() is None:
+            seen = max(seen, n_colours(display))
+            time.sleep(0.2)
+    assert run.returncode == 0
+    assert seen > 100  # an empty screen has one
+
+
+def test_window_that_fails_is_replaced_by_the_page(display: str, tmp_path: Path) -> None:
+    """The viewer cannot draw with this back end of its own; training hears of it and goes on."""
+    pytest.importorskip("rerun")
+    done = scilab_rl(
+        PIXELS,
+        "algorithm=random",
+        "render=display",
+        "mlflow=0",
+        "n_epochs=2",
+        "render_freq=1",
+        "eval_after_n_steps=20000",
+        cwd=tmp_path,
+        DISPLAY=display,
+        WGPU_BACKEND="none",
+    )
+    assert done.returncode == 0, done.stderr
+    lines = done.stderr.splitlines()
+    (number,) = [i for i, line in enumerate(lines) if "No window can be opened (" in line]
+    assert "Live view: http://127.0.0.1:" in lines[number + 1]
+    assert sum("keeps what it has shown" in line for line in lines) == 1
+
+
+def test_f33_window_listens_to_this_machine_only(display: str) -> None:
+    pytest.importorskip("rerun")
+    script = """
+import psutil, time
+from scilab_rl.visualization.live import LiveViewer
+viewer = LiveViewer((), window=True)
+(window,) = psutil.Process().children()
+addresses = set()
+deadline = time.monotonic() + 8
+while time.monotonic() < deadline and window.is_running() and window.status() != "zombie":
+    addresses |= {c.laddr.ip for c in window.net_connections("tcp") if c.status == "LISTEN"}
+    time.sleep(0.005)
+print(sorted(addresses))
+viewer.close()
+if window.is_running():
+    window.kill()
+"""
+    environment = quiet_environment(DISPLAY=display)
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=environment, capture_output=True, text=True, check=False
+    )
+    assert done.stdout == "['127.0.0.1']\n", done.stderr
+
+
+def test_f34_stuck_viewer_delays_neither_training_nor_its_end() -> None:
+    pytest.importorskip("rerun")
+    done = subprocess.run(
+        [sys.executable, "-c", WITH_STUCK_VIEWER],
+        env=quiet_environment(),
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    ended = time.time()
+    assert done.returncode == 0, done.stderr
+    counts, closed = done.stdout.splitlines()
+    n_dropped, longest = (float(word) for word in counts.split())
+    assert n_dropped >= 500
+    assert longest < 0.1
+    assert ended - float(closed) < 6.0  # the viewer's package alone would wait for eleven seconds
+    assert done.stderr.count("does not keep up") == 1
+
+
+def n_colours(display: str) -> int:
+    """Return how many colours there are on a display, looking at every eighth row."""
+    from PIL import ImageGrab
+
+    with ImageGrab.grab(xdisplay=display) as image:
+        return len(image.resize((300, 200)).getcolors(60_000) or ())
+
+
+def test_f25_without_display_a_window_is_refused(tmp_path: Path) -> None:
+    done = scilab_rl(
+        "env=FetchReach", "render=human", *QUICK, cwd=tmp_path, DISPLAY="", WAYLAND_DISPLAY=""
+    )
+    assert done.returncode == 2
+    assert "render=display" in done.stderr.splitlines()[-1]
+    assert not list((tmp_path / "data").glob("*/*"))
+
+
+def test_f26_without_ffmpeg_page_and_episode_are_kept(tmp_path: Path) -> None:
+    options = [PIXELS, *RECORD, "n_epochs=1", "eval_after_n_steps=40"]
+    done = scilab_rl(*options, cwd=tmp_path, IMAGEIO_FFMPEG_EXE="/nonexistent", PATH="")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr.count(".mp4 could not be written") == 1
+    kept = [path.suffix for path in (last_run(tmp_path) / "episodes").iterdir()]
+    assert ".mp4" not in kept
+    assert kept.count(".npz") == kept.count(".html") == 2
