@@ -13,7 +13,7 @@ Prints one JSON object with
   A B B A within one run, so that slow changes of the machine's load cancel; ``interval`` holds 95 %
   of the bootstrapped medians. There are no updates in them, which would hide the viewer's share.
 
-Run: python benchmarks/showing.py
+Run: python benchmarks/showing.py [RESULT.json]
 """
 
 from __future__ import annotations
@@ -57,7 +57,10 @@ def main() -> None:
             "stuck_viewer": speed_with_viewer(stuck=True),
             "load_average": os.getloadavg()[0],
         }
-    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    text = json.dumps(result, indent=2) + "\n"
+    sys.stdout.write(text)
+    for path in sys.argv[1:]:
+        Path(path).write_text(text, encoding="utf-8")
 
 
 def unwatched_share() -> float:
