@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from scilab_rl.visualization.records import Clip, value_range
+from scilab_rl.visualization.records import Clip, title_of, value_range
 
 COLOURS = (
     "#2563eb",
@@ -145,7 +145,7 @@ class PanelSheet:
         big = _big
         draw.text(
             big(panel.left - _LEFT + 12, panel.top - _TITLE / 2 - 1),
-            _shortened(panel.name, 30),
+            _shortened(title_of(panel.name), 30),
             fill=INK,
             font=_font(13 * _SMOOTH),
             anchor="lm",
@@ -212,7 +212,7 @@ class PanelSheet:
         """Write a current value left of the last one; return where the next one may end."""
         font = _font(12)
         width = draw.textlength(text, font=font)
-        if right - width < panel.left + 9 * min(len(panel.name), 30) - _LEFT + 12:
+        if right - width < panel.left + 9 * min(len(title_of(panel.name)), 30) - _LEFT + 12:
             return 0
         where = (right, panel.top - _TITLE / 2 - 1)
         draw.text(where, text, fill=colour, font=font, anchor="rm")

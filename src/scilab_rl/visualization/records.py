@@ -17,6 +17,8 @@ from typing import Any
 
 import numpy as np
 
+# Rewards, values and distances are in the task's own units.
+_UNITS = {"entropy": "nats", "log_prob": "nats"}
 _JPEG_QUALITY = 88
 _FLAT = 5e-3  # smaller relative changes are drawn as none: four digits could not tell them apart
 _SMALL_SIDE = 200  # pixels; small frames cost little without loss
@@ -119,6 +121,15 @@ def panel_of(curve: str) -> str:
     'q_values'
     """
     return re.sub(r"\[[^\]]*\]$", "", curve)
+
+
+def title_of(panel: str) -> str:
+    """Return what is written above a panel: its metric, with the unit where it has one.
+
+    >>> title_of("entropy"), title_of("reward")
+    ('entropy (nats)', 'reward')
+    """
+    return f"{panel} ({_UNITS[panel]})" if panel in _UNITS else panel
 
 
 def label_of(curve: str) -> str:

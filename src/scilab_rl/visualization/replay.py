@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from scilab_rl import files
-from scilab_rl.visualization.records import Clip, media_type, value_range
+from scilab_rl.visualization.records import Clip, media_type, title_of, value_range
 
 _DATA = "@CLIP@"
 PHASES = {"train": "training", "eval": "evaluation"}
@@ -46,7 +46,7 @@ def _content(clip: Clip) -> dict[str, Any]:
 def _panel(clip: Clip, name: str) -> dict[str, Any]:
     curves = clip.curves(name)
     return {
-        "name": name,
+        "name": title_of(name),
         "range": value_range(list(curves.values())),
         "curves": [{"label": label, "values": values} for label, values in curves.items()],
     }

@@ -10,7 +10,15 @@ from typing import Any
 
 from scilab_rl.errors import MissingDependencyError
 from scilab_rl.visualization.panels import COLOURS, grid
-from scilab_rl.visualization.records import Clip, ClipInfo, Record, label_of, media_type, panel_of
+from scilab_rl.visualization.records import (
+    Clip,
+    ClipInfo,
+    Record,
+    label_of,
+    media_type,
+    panel_of,
+    title_of,
+)
 
 APPLICATION = "scilab-rl"
 PHASES = {"train": "training", "eval": "evaluation"}
@@ -167,7 +175,7 @@ def _curve_view(rerun: Any, panel: str) -> Any:
     entity = rerun.new_entity_path(["metrics", panel])
     corner = rerun.blueprint.Corner2D.LeftTop
     return rerun.blueprint.TimeSeriesView(
-        origin=entity, name=panel, plot_legend=rerun.blueprint.PlotLegend(corner=corner)
+        origin=entity, name=title_of(panel), plot_legend=rerun.blueprint.PlotLegend(corner=corner)
     )
 
 

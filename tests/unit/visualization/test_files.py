@@ -202,3 +202,11 @@ def test_folder_that_cannot_be_written_ends_no_training(tmp_path: Path) -> None:
     recorder.end()
     recorder.close()
     assert recorder.recordings == []
+
+
+def test_page_names_the_unit_of_a_metric_that_has_one(tmp_path: Path) -> None:
+    clip = make_clip(("entropy", "reward"))
+    write_replay(clip, tmp_path / "x.html")
+    page = (tmp_path / "x.html").read_text(encoding="utf-8")
+    assert '"name": "entropy (nats)"' in page
+    assert '"name": "reward"' in page
