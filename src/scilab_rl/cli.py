@@ -22,6 +22,7 @@ COMMANDS = {
     "resume": "continue an interrupted run",
     "new": "create an algorithm of your own from an existing one",
     "runs": "list the recorded runs",
+    "profile": "train for a little while and show where the time goes",
     "study": "show what a hyperparameter study has found",
     "algorithms": "list the algorithms",
     "envs": "list the environments",

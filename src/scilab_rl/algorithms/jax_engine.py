@@ -186,9 +186,8 @@ class Rounds:
         Args:
             batch: One update's transitions per entry. Shapes: ``(n_updates, batch, ...)``.
         """
-        key = jax.device_put(jax.random.key(self.seed), self._device)
-        first = np.uint32(self.n_started)
-        self.state, self._losses = self._compute(self.state, batch, key, first)
+        seed, first = np.uint32(self.seed), np.uint32(self.n_started)
+        self.state, self._losses = self._compute(self.state, batch, seed, first)
         self.n_started += len(batch.rewards)
 
     def finish(self, **shown: Any) -> dict[str, torch.Tensor]:
@@ -224,10 +223,11 @@ def _scan(
     update: Callable[..., tuple[State, dict[str, Array]]],
     state: State,
     batches: Batch,
-    key: Array,
+    seed: Array,
     first: Array,
 ) -> tuple[State, dict[str, Array]]:
     """Do one update per entry of the batches, one after the other."""
+    key = jax.random.key(seed)
 
     def one(state: State, item: tuple[Array, Batch]) -> tuple[State, dict[str, Array]]:
         index, batch = item
