@@ -36,7 +36,8 @@ import copy
 import itertools
 import math
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
 from typing import Any
 
@@ -53,6 +54,7 @@ from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm
 from scilab_rl.algorithms.observations import state_columns
 
 LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
+Autocast = Callable[[], AbstractContextManager[Any]]
 MODEL_LOG_STD_MIN, MODEL_LOG_STD_MAX = -5.0, 2.0
 # Weight eta of the intrinsic reward; learning rate and hidden layers of the two models.
 MC_DEFAULTS = {"reward_eta": 0.01, "learning_rate": 1e-3, "net_arch": (256,)}
@@ -66,13 +68,19 @@ class Actor(nn.Module):
         n_actions: Dimensions of an action.
         net_arch: Sizes of the hidden layers.
         scale: Largest action.
+        autocast: Opens a context for the matrix products, see `autocast_to`.
 
     Shapes:
         observations: ``(batch, n_observations)``; actions: ``(batch, n_actions)``.
     """
 
     def __init__(
-        self, n_observations: int, n_actions: int, net_arch: Sequence[int], scale: float
+        self,
+        n_observations: int,
+        n_actions: int,
+        net_arch: Sequence[int],
+        scale: float,
+        autocast: Autocast = nullcontext,
     ) -> None:
         super().__init__()
         layers: list[nn.Module] = []
@@ -80,10 +88,13 @@ class Actor(nn.Module):
             layers += [nn.Linear(n_in, n_out), nn.ReLU()]
         self.net = nn.Sequential(*layers, nn.Linear([n_observations, *net_arch][-1], 2 * n_actions))
         self.scale = scale
+        self.autocast = autocast
 
     def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Return mean and logarithm of the standard deviation, before squashing."""
-        mean, log_std = self.net(observations).chunk(2, dim=-1)
+        with self.autocast():
+            parameters = self.net(observations)
+        mean, log_std = parameters.float().chunk(2, dim=-1)
         return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
@@ -116,9 +127,15 @@ class Critics(nn.Module):
     """
 
     def __init__(
-        self, n_observations: int, n_actions: int, net_arch: Sequence[int], n_critics: int
+        self,
+        n_observations: int,
+        n_actions: int,
+        net_arch: Sequence[int],
+        n_critics: int,
+        autocast: Autocast = nullcontext,
     ) -> None:
         super().__init__()
+        self.autocast = autocast
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for n_in, n_out in itertools.pairwise([n_observations + n_actions, *net_arch, 1]):
             bound = 1 / math.sqrt(n_in)  # the initialisation of torch.nn.Linear
@@ -129,9 +146,11 @@ class Critics(nn.Module):
         """Return the value that each critic gives to each pair."""
         inputs = torch.cat([observations, actions], dim=1)
         hidden = inputs.expand(len(self.weights[0]), *inputs.shape)
-        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            hidden = F.relu(torch.baddbmm(bias, hidden, weight))
-        return torch.baddbmm(self.biases[-1], hidden, self.weights[-1]).squeeze(-1).T
+        with self.autocast():
+            for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+                hidden = F.relu_(torch.baddbmm(bias, hidden, weight))
+        # The last layer has one output: a sum is faster than a matrix product of one column.
+        return ((hidden * self.weights[-1].mT).sum(dim=-1) + self.biases[-1].squeeze(-1)).T
 
 
 class NextStateModel(nn.Module):
@@ -181,6 +200,7 @@ class CLEANSACMC(OneFileAlgorithm):
         log_obs_step: Whether each dimension of the observation is recorded at each step.
         log_act_step: The same for actions.
         net_arch: Sizes of the hidden layers of actor and critics.
+        precision: ``float32`` or ``bfloat16``, of the matrix products.
         mc: ``reward_eta``, weight of the intrinsic reward, and ``learning_rate`` and ``net_arch``
             of the two models; what is missing comes from ``MC_DEFAULTS``.
         replay_buffer_class: None: a plain replay buffer.
@@ -210,6 +230,7 @@ class CLEANSACMC(OneFileAlgorithm):
         log_obs_step: bool = False,
         log_act_step: bool = False,
         net_arch: Sequence[int] = (256, 256),
+        precision: str = "float32",
         mc: Mapping[str, Any] | None = None,
         replay_buffer_class: type[ReplayBuffer] | None = None,
         replay_buffer_kwargs: dict[str, Any] | None = None,
@@ -230,8 +251,9 @@ class CLEANSACMC(OneFileAlgorithm):
         self.log_act_step = log_act_step
 
         sizes = (self.n_observations, self.n_actions, net_arch)
-        self.actor = Actor(*sizes, scale=action_scale_factor).to(self.device)
-        self.critic = Critics(*sizes, n_critics).to(self.device)
+        autocast = autocast_to(precision, self.device)
+        self.actor = Actor(*sizes, action_scale_factor, autocast).to(self.device)
+        self.critic = Critics(*sizes, n_critics, autocast).to(self.device)
         self.critic_target = copy.deepcopy(self.critic).requires_grad_(False)
         adam = partial(torch.optim.Adam, lr=learning_rate, fused=True)
         self.actor_optimizer = adam(self.actor.parameters())
@@ -498,6 +520,18 @@ def follow(target: nn.Module, source: nn.Module, tau: float) -> None:
     """Move the target network a fraction tau towards the learned one."""
     for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
         slow.lerp_(fast, tau)
+
+
+def autocast_to(precision: str, device: torch.device) -> Autocast:
+    """Return what opens a context whose matrix products have this precision.
+
+    Weights, gradients of weights, losses and everything outside of the context stay float32.
+    """
+    if precision == "float32":
+        return nullcontext
+    if precision != "bfloat16":
+        raise ValueError(f"precision must be float32 or bfloat16, but it is {precision!r}")
+    return partial(torch.autocast, device.type, torch.bfloat16)
 
 
 def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:

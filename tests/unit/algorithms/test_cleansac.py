@@ -121,6 +121,29 @@ def test_batched_critics_equal_separate_networks() -> None:
     assert not torch.equal(together[:, 0], together[:, 1])
 
 
+def test_bfloat16_is_for_matrix_products_alone(make: Any) -> None:
+    exact, rough = make(precision="float32"), make(precision="bfloat16")
+    observations = torch.linspace(-1, 1, 18).reshape(3, 6)
+    actions = torch.linspace(1, -1, 6).reshape(3, 2)
+    values = rough.critic(observations, actions)
+    expected = exact.critic(observations, actions)
+    assert values.dtype == torch.float32
+    assert not torch.equal(values, expected)
+    # 8 bits of mantissa: each of a layer's terms, of size 1 at most here, is off by 2^-9 or less.
+    torch.testing.assert_close(values, expected, rtol=0, atol=8 * 2**-9)
+    mean, log_std = rough.actor(observations)
+    assert mean.dtype == log_std.dtype == torch.float32
+    torch.testing.assert_close(mean, exact.actor(observations)[0], rtol=0, atol=8 * 2**-9)
+    rough.learn(60)
+    for network in (rough.actor, rough.critic, rough.critic_target):
+        assert {parameter.dtype for parameter in network.parameters()} == {torch.float32}
+
+
+def test_other_precisions_are_refused(make: Any) -> None:
+    with pytest.raises(ValueError, match=r"precision must be float32 or bfloat16, .* 'half'"):
+        make(precision="half")
+
+
 @pytest.mark.parametrize(
     ("given", "expected"),
     [("auto", (True, 1.0)), ("auto_0.1", (True, 0.1)), (0.2, (False, 0.2)), ("0.3", (False, 0.3))],
