@@ -1,11 +1,17 @@
 """Draw docs/images/environments.png: one frame of each environment, after some random steps.
 
+MyoSuite's frame is drawn by .venv-myosuite, where `make test-myosuite` has made it. CoppeliaSim is
+not there: its frames come from the real simulator, and the tests' stand-in draws dots.
+
 MUJOCO_GL=egl python docs/draw_environments.py
 """
 
 from __future__ import annotations
 
 import importlib.util
+import subprocess
+import sys
+import tempfile
 from pathlib import Path
 
 import matplotlib
@@ -19,7 +25,11 @@ from scilab_rl.envs.fingerprint import scripted_action
 from scilab_rl.envs.vectorize import EnvSettings, make_single_env
 
 TARGET = Path(__file__).parent / "images" / "environments.png"
+MYOSUITE_PYTHON = Path(__file__).parents[1] / ".venv-myosuite" / "bin" / "python"
 N_STEPS, N_COLUMNS = 8, 5
+CAPTION = (
+    "Not shown: CoppeliaReach-v0 and CoppeliaDrive-v0, whose frames come from the simulator itself."
+)
 ENVIRONMENTS = [
     "FetchReach-v4",
     "FetchPush-v4",
@@ -39,8 +49,10 @@ ENVIRONMENTS = [
 SUITES = {
     "highway_env": ["parking-limited-v0"],
     "metaworld": ["MetaW-drawer-close-v3", "MetaW-pick-place-sparse-v3", "MetaW-reach-v3"],
-    "panda_gym": ["PandaReach-v3"],
+    "panda_gym": ["PandaReach-v3", "PandaStack-v3"],
+    "Box2D": ["LunarLander-v3"],
 }
+MYOSUITE = ["myoElbowPose1D6MRandom-v0", "myoHandReachRandom-v0"]
 
 
 def frame_of(env_id: str) -> np.ndarray:
@@ -55,18 +67,32 @@ def frame_of(env_id: str) -> np.ndarray:
     return frame
 
 
+def frame_by_myosuite(env_id: str) -> np.ndarray:
+    """Return the frame that another virtual environment draws."""
+    with tempfile.NamedTemporaryFile(suffix=".npy") as file:
+        subprocess.run([MYOSUITE_PYTHON, __file__, env_id, file.name], check=True)
+        return np.load(file.name)
+
+
 def main() -> None:
-    """Draw the sheet."""
+    """Draw the sheet, or, with an id and a file, save this one frame."""
+    if len(sys.argv) == 3:
+        np.save(sys.argv[2], frame_of(sys.argv[1]))
+        return
     installed = [ids for package, ids in SUITES.items() if importlib.util.find_spec(package)]
     env_ids = [*ENVIRONMENTS, *(env_id for ids in installed for env_id in ids)]
-    n_rows = -(-len(env_ids) // N_COLUMNS)
+    frames = {env_id: frame_of(env_id) for env_id in env_ids}
+    if MYOSUITE_PYTHON.exists():
+        frames |= {env_id: frame_by_myosuite(env_id) for env_id in MYOSUITE}
+    n_rows = -(-len(frames) // N_COLUMNS)
     figure, axes = plt.subplots(n_rows, N_COLUMNS, figsize=(3 * N_COLUMNS, 3.3 * n_rows))
     for axis in axes.flat:
         axis.axis("off")
-    for axis, env_id in zip(axes.flat, env_ids, strict=False):
-        axis.imshow(frame_of(env_id))
+    for axis, (env_id, frame) in zip(axes.flat, frames.items(), strict=False):
+        axis.imshow(frame)
         axis.set_title(env_id, fontsize=7 if len(env_id) < 40 else 5)
-    figure.tight_layout()
+    figure.tight_layout(rect=(0, 0.02, 1, 1))
+    figure.text(0.01, 0.006, CAPTION, fontsize=8)
     figure.savefig(TARGET, dpi=80)
 
 

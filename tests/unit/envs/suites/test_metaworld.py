@@ -11,7 +11,7 @@ pytest.importorskip("metaworld")
 
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-from scilab_rl.envs.suites.metaworld import GOAL_TASKS, WITHOUT_GOALS
+from scilab_rl.envs.suites.metaworld import GOAL_TASKS, SAME_GOAL, WITHOUT_GOALS
 
 # One of each kind of row: object, gripper, one axis, two axes, site and scale, offset, height.
 KINDS = (
@@ -50,6 +50,16 @@ def test_each_task_is_there_as_it_is_and_with_goals_or_with_a_reason_why_not() -
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("task", SAME_GOAL)
+def test_these_tasks_have_the_same_goal_but_other_places(task) -> None:
+    env = gym.make(resolve_env_id(f"MetaW-{task}-sparse")[0])
+    firsts = [env.reset(seed=seed)[0] for seed in range(4)]
+    assert len({first["desired_goal"].tobytes() for first in firsts}) == 1
+    assert len({first["observation"].tobytes() for first in firsts}) == 4
+    env.close()
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("task", sorted(name[:-3] for name in ALL_V3_ENVIRONMENTS))
 def test_all_tasks_draw_a_new_goal_or_place_at_each_reset(task) -> None:
     env = gym.make(resolve_env_id(f"MetaW-{task}")[0])
@@ -77,3 +87,26 @@ class TestGoalTask(EnvironmentContract):
 class TestOriginal(EnvironmentContract):
     env = "MetaW-drawer-close-v3"
     n_steps = 100
+
+
+@pytest.fixture(params=sorted(GOAL_TASKS))
+def goal_task(request):
+    request.instance.env = f"MetaW-{request.param}-sparse-v3"
+    request.instance.accepted = ("new goals",) if request.param in SAME_GOAL else ()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("goal_task")
+class TestAllGoalTasks(EnvironmentContract):
+    n_steps = 30
+
+
+@pytest.fixture(params=sorted(name.removesuffix("-v3") for name in ALL_V3_ENVIRONMENTS))
+def original(request):
+    request.instance.env = f"MetaW-{request.param}-v3"
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("original")
+class TestAllOriginals(EnvironmentContract):
+    n_steps = 30
