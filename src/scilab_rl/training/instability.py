@@ -31,7 +31,7 @@ class InstabilityRecord:
     def on_step(self, batch: StepBatch) -> None:
         """Look at a step of all environments."""
         for index in np.flatnonzero(batch.dones):
-            info = batch.infos[index]
+            info = batch.infos[int(index)]
             states = info.pop(STATES_KEY, None)
             if info.get(UNSTABLE_KEY):
                 self.n_episodes += 1

@@ -24,6 +24,12 @@ _GRAVITY = -9.81  # panda-gym's, in m/s^2
 class Repeatable(RobotTaskEnv):
     """The parts that all tasks share; it comes before the task in the order of classes."""
 
+    action_space: Any
+    observation_space: Any
+    _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
+    _is_new: bool
+    _is_building: bool
+
     def __new__(cls, *args: Any, **kwargs: Any) -> Repeatable:
         """Remember the arguments, which the world is built from."""
         self = super().__new__(cls)
