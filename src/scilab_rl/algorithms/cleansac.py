@@ -134,11 +134,12 @@ class Critics(nn.Module):
         """Return the value that each critic gives to each pair."""
         inputs = torch.cat([observations, actions], dim=1)
         hidden = inputs.expand(len(self.weights[0]), *inputs.shape)
+        *hidden_layers, (last_weight, last_bias) = zip(self.weights, self.biases, strict=True)
         with self.autocast():
-            for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            for weight, bias in hidden_layers:
                 hidden = F.relu_(torch.baddbmm(bias, hidden, weight))
         # The last layer has one output: a sum is faster than a matrix product of one column.
-        return ((hidden * self.weights[-1].mT).sum(dim=-1) + self.biases[-1].squeeze(-1)).T
+        return ((hidden * last_weight.mT).sum(dim=-1) + last_bias.squeeze(-1)).T
 
 
 class CLEANSAC(OneFileAlgorithm):
