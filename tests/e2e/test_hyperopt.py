@@ -69,7 +69,7 @@ def test_the_same_command_repeats_nothing(finished: Path) -> None:
     assert runs_of(study_of(finished, "mine")) == before
 
 
-def test_another_search_space_is_refused(finished: Path) -> None:
+def test_f20_another_search_space_is_refused(finished: Path) -> None:
     done = scilab_rl(
         *TINY_RUNS, "algorithm.gamma=interval(0.5,0.99)", "--multirun",
         "hydra.sweeper.min_trials_per_param=2", "hydra.sweeper.study_name=mine", cwd=finished,
@@ -102,7 +102,7 @@ def test_study_command_shows_and_keeps_the_winner(finished: Path) -> None:
     shutil.rmtree(finished / "conf")
 
 
-def test_crashed_runs_give_exit_code_3_and_the_others_go_on(tmp_path: Path) -> None:
+def test_f12_crashed_runs_give_exit_code_3_and_the_others_go_on(tmp_path: Path) -> None:
     done = scilab_rl(
         *TINY_RUNS, "algorithm.learning_starts=10", "algorithm.batch_size=16",
         "algorithm.learning_rate=0.001,1e30", "--multirun", "hydra.sweeper.max_trials=4",

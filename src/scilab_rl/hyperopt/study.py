@@ -34,6 +34,7 @@ from scilab_rl.hyperopt.worker import Message, Task
 from scilab_rl.seeding import derive_seed
 
 _POLL_SECONDS = 0.5
+_LOOK_SECONDS = 1.0  # how often the ledger is read while all workers are busy
 
 
 @dataclass(frozen=True)
@@ -111,6 +112,7 @@ class Study:
             maximize=settings.rules.maximize,
         )
         self._finished = False
+        self._next_look = 0.0
 
     def work(self) -> None:
         """Train until the study is over; the ledger then holds everything."""
@@ -146,6 +148,12 @@ class Study:
 
     def _assign(self) -> bool:
         """Give all free workers something to do and tell whether the study goes on."""
+        if self.pool.has_room() or time.monotonic() > self._next_look:
+            self._look_and_submit()
+            self._next_look = time.monotonic() + _LOOK_SECONDS
+        return self.pool.n_busy > 0 or not (self.stop.reason or self._finished)
+
+    def _look_and_submit(self) -> None:
         with self.ledger.locked():
             self.runs = self.ledger.recover_lost_runs(self.ledger.runs())
             self._note_reasons_to_stop()
@@ -157,7 +165,6 @@ class Study:
                     break
                 self._store(run)
                 self.pool.submit(run.number, self._task(run))
-        return self.pool.n_busy > 0 or not (self.stop.reason or self._finished)
 
     def _next_run(self) -> Run | None:
         """Return the next run to start, already noted as running, or None for now."""
@@ -336,9 +343,15 @@ class Study:
 def same_failure(runs: Sequence[Run], count: int) -> str:
     """Return the message with which the first ``count`` finished runs all failed, or nothing.
 
-    Numbers and paths in the message may differ.
+    Numbers and paths in the message may differ. Runs that were stopped because their setting had
+    failed already say nothing.
     """
-    ended = [run for run in runs if run.state in (COMPLETE, PRUNED, FAILED)][:count]
+    broken = {run.trial for run in runs if run.state == FAILED}
+    ended = [
+        run
+        for run in runs
+        if run.state in (COMPLETE, FAILED) or (run.state == PRUNED and run.trial not in broken)
+    ][:count]
     if not count or len(ended) < count or any(run.state != FAILED for run in ended):
         return ""
     kinds = {re.sub(r"\(details in .*|[\d.]+", "", run.error) for run in ended}

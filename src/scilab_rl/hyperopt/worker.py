@@ -27,11 +27,13 @@ class Task:
         overrides: Its configuration, as typed on a command line.
         criterion: The metric to report at each evaluation.
         run_dir: An interrupted run to continue from its newest checkpoint, if it has one.
+        n_final_episodes: Evaluation episodes of the finished policy, on a seed of their own.
     """
 
     overrides: tuple[str, ...]
     criterion: str
     run_dir: str = ""
+    n_final_episodes: int = 0
 
 
 @dataclass(frozen=True)
@@ -114,8 +116,13 @@ def _run(task: Task, channel: Channel) -> dict[str, Any]:
     result = _start_or_continue(task, watch)
     # The file holds the whole curve, also of a run that was continued.
     rows = read_epochs(RunDirectory(Path(result.run_dir)))
+    final = None
+    if task.n_final_episodes and not told_to_stop:
+        measured = experiment.measure(RunDirectory(Path(result.run_dir)), task.n_final_episodes)
+        final = experiment.criterion_of(measured, task.criterion)
     return {
         "status": "pruned" if told_to_stop else result.status,
+        "final": final,
         "run_dir": result.run_dir,
         "seconds": result.seconds,
         "steps": [row["step"] for row in rows],

@@ -115,15 +115,28 @@ OLD = {
 }  # fmt: skip
 
 
-def test_a_study_keeps_its_budget_and_its_space() -> None:
+def test_a_study_keeps_its_budget() -> None:
     refuse_changes(OLD, OLD, StudySettings())
     shorter = OLD | {"configuration": {"n_epochs": "2", "env": "X"}}
     with pytest.raises(ConfigError, match=r"n_epochs: 60 \(now 2\).*another study_name"):
         refuse_changes(OLD, shorter, StudySettings(allow_space_change=True))
-    wider = OLD | {"space": {"a": {"low": 0.0, "high": 2.0}}}
-    with pytest.raises(ConfigError, match=r"'high': 1.0.*'high': 2.0.*allow_space_change"):
-        refuse_changes(OLD, wider, StudySettings())
-    refuse_changes(OLD, wider, StudySettings(allow_space_change=True))
+
+
+@pytest.mark.parametrize(
+    ("entry", "difference"),
+    [
+        ({"low": -1.0, "high": 1.0}, r"'low': 0.0.*now.*'low': -1.0"),
+        ({"low": 0.0, "high": 2.0}, r"'high': 1.0.*now.*'high': 2.0"),
+        ({"choices": [0.0, 1.0]}, r"'high': 1.0.*now.*'choices': \[0.0, 1.0\]"),
+        (None, r"'high': 1.0.*now absent"),
+    ],
+)
+def test_f20_changed_space_is_refused_with_the_difference(entry: Any, difference: str) -> None:
+    changed = OLD | {"space": {"a": entry} if entry else {}}
+    remedies = "another study_name.*allow_space_change=true"
+    with pytest.raises(ConfigError, match=f"{difference}.*{remedies}"):
+        refuse_changes(OLD, changed, StudySettings())
+    refuse_changes(OLD, changed, StudySettings(allow_space_change=True))
 
 
 def test_best_of_needs_a_study_with_a_winner(tmp_path, monkeypatch) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
+import random
 import signal
+import sqlite3
 import subprocess
 import sys
 import threading
@@ -14,10 +16,12 @@ from pathlib import Path
 import pytest
 from optuna.trial import TrialState
 
+from scilab_rl.errors import ScilabRLError
 from scilab_rl.hyperopt.folders import DATABASE, STOP_FILE
 from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.runs import COMPLETE, FAILED, LOST, PRUNED, RUNNING
 from scilab_rl.hyperopt.source import settings_of
+from scilab_rl.hyperopt.summary import summarize
 
 from . import toy
 
@@ -62,7 +66,7 @@ def test_small_space_is_tried_completely_and_then_raced(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_one_worker_draws_the_same_settings_after_a_kill(tmp_path: Path) -> None:
+def test_f16_one_worker_draws_the_same_settings_after_a_kill(tmp_path: Path) -> None:
     whole = toy.run(tmp_path / "whole", n_workers=1, max_trials=8)
     process = start(tmp_path / "parts", 8, n_workers=1)
     wait_for_runs(tmp_path / "parts", 3)
@@ -74,14 +78,14 @@ def test_one_worker_draws_the_same_settings_after_a_kill(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("fault", ["kill", "segfault", "exit"])
-def test_dead_worker_is_replaced_and_its_run_repeated(fault: str, tmp_path: Path) -> None:
+def test_f15_dead_worker_is_replaced_and_its_run_repeated(fault: str, tmp_path: Path) -> None:
     study = toy.run(tmp_path / "study", f"die={fault}", f"once={tmp_path / 'died'}", max_trials=4)
     assert {run.state for run in study.runs} == {COMPLETE}
     assert [run.attempt for run in study.runs].count(1) == 1
     assert len(searched(study)) == 4
 
 
-def test_run_that_always_kills_its_worker_fails_and_never_scores(tmp_path: Path) -> None:
+def test_f15_run_that_always_kills_its_worker_fails_and_never_scores(tmp_path: Path) -> None:
     study = toy.run(
         tmp_path / "study", "die=kill", "where=0.75", space=toy.CHOICES, max_retries=1,
         max_trials=14,
@@ -95,7 +99,7 @@ def test_run_that_always_kills_its_worker_fails_and_never_scores(tmp_path: Path)
     assert told == [bad[0].trial]
 
 
-def test_hanging_run_is_killed_after_its_timeout(tmp_path: Path) -> None:
+def test_f15_hanging_run_is_killed_after_its_timeout(tmp_path: Path) -> None:
     study = toy.run(
         tmp_path / "study", "die=hang", "where=0.25", space=toy.CHOICES, trial_timeout=1,
         max_trials=10,
@@ -106,14 +110,14 @@ def test_hanging_run_is_killed_after_its_timeout(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("direction", ["maximize", "minimize"])
-def test_nan_never_wins(direction: str, tmp_path: Path) -> None:
+def test_f12_nan_never_wins(direction: str, tmp_path: Path) -> None:
     study = toy.run(tmp_path / "study", "nan=1", direction=direction, fail_fast=0, max_trials=4)
     assert {run.state for run in study.runs} == {FAILED}
     assert "no finite number" in study.runs[0].error
     assert study.winner() is None
 
 
-def test_ends_early_when_the_first_runs_fail_alike(tmp_path: Path) -> None:
+def test_f19_ends_early_when_the_first_runs_fail_alike(tmp_path: Path) -> None:
     study = toy.run(tmp_path / "study", "error=boom at step 3", max_trials=40)
     assert "first 5 runs all failed: boom" in study.stop.reason
     assert len(study.runs) <= 6
@@ -169,7 +173,7 @@ def test_ctrl_c_ends_the_study_after_the_running_runs(tmp_path: Path) -> None:
     assert {run.state for run in Ledger(tmp_path / "study").runs()} <= {COMPLETE, PRUNED}
 
 
-def test_killed_parent_takes_its_workers_along_and_loses_nothing(tmp_path: Path) -> None:
+def test_f16_killed_parent_takes_its_workers_along_and_loses_nothing(tmp_path: Path) -> None:
     process = start(tmp_path / "study", 10)
     wait_for_runs(tmp_path / "study", 3)
     children = descendants(process.pid)
@@ -185,7 +189,7 @@ def test_killed_parent_takes_its_workers_along_and_loses_nothing(tmp_path: Path)
     assert not [run for run in study.runs if run.state in (RUNNING, LOST)]
 
 
-def test_database_with_leftovers_of_a_crash_opens(tmp_path: Path) -> None:
+def test_f18_database_with_leftovers_of_a_crash_opens(tmp_path: Path) -> None:
     toy.run(tmp_path / "study", max_trials=4)
     (tmp_path / "study" / f"{DATABASE}-journal").write_bytes(b"torn")
     (tmp_path / "study" / "locks" / "1-dead.lease").touch()
@@ -193,7 +197,7 @@ def test_database_with_leftovers_of_a_crash_opens(tmp_path: Path) -> None:
     assert len(searched(study)) == 6
 
 
-def test_two_parents_share_one_budget(tmp_path: Path) -> None:
+def test_f17_two_parents_share_one_budget(tmp_path: Path) -> None:
     processes = [start(tmp_path / "study", 12) for _ in range(2)]
     outputs = [process.communicate(timeout=60) for process in processes]
     assert [output for output, _ in outputs] == ["finished\n"] * 2, outputs
@@ -205,11 +209,10 @@ def test_two_parents_share_one_budget(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_killed_again_and_again_ends_with_the_exact_total(tmp_path: Path) -> None:
+@pytest.mark.parametrize("seed", range(4))
+def test_f16_killed_again_and_again_ends_with_the_exact_total(seed: int, tmp_path: Path) -> None:
     """SIGKILL at random moments until it is done, as in Ray's stress test."""
-    import random
-
-    rng, n_kills = random.Random(0), 0
+    rng, n_kills = random.Random(seed), 0
     for _ in range(40):
         process = start(tmp_path / "study", 30)
         try:
@@ -227,14 +230,75 @@ def test_killed_again_and_again_ends_with_the_exact_total(tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_many_first_openings_and_shared_studies(tmp_path: Path) -> None:
-    for round_ in range(5):
-        folder = tmp_path / f"study{round_}"
-        processes = [start(folder, 10) for _ in range(8 if round_ == 0 else 2)]
+def test_f17_two_parents_share_again_and_again(tmp_path: Path) -> None:
+    for repetition in range(20):
+        folder = tmp_path / f"study{repetition}"
+        processes = [start(folder, 10) for _ in range(2)]
         for process in processes:
             output, errors = process.communicate(timeout=120)
             assert (output, "locked" in errors) == ("finished\n", False), errors
-        assert len([run for run in Ledger(folder).runs() if not run.is_final]) == 10
+        runs = Ledger(folder).runs()
+        assert [run.number for run in runs] == list(range(11))
+        assert len({(run.trial, run.repeat) for run in runs}) == 11
+        assert {run.state for run in runs} == {COMPLETE}
+
+
+@pytest.mark.slow
+def test_f17_eight_processes_open_a_study_first(tmp_path: Path) -> None:
+    """Each makes the tables, unless another is faster."""
+    code = (
+        "import sys; from pathlib import Path; from scilab_rl.hyperopt.ledger import Ledger; "
+        "ledger = Ledger(Path(sys.argv[1])); sys.stdin.read()"
+    )
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", code, str(tmp_path / "study")],
+            stdin=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        )
+        for _ in range(8)
+    ]  # fmt: skip
+    errors = [process.communicate(timeout=120)[1] for process in processes]
+    assert [process.returncode for process in processes] == [0] * 8, errors
+    assert len(toy.run(tmp_path / "study", max_trials=2).runs) == 3
+
+
+def test_f18_locked_database_is_waited_for(tmp_path: Path) -> None:
+    toy.run(tmp_path / "study", max_trials=2)
+    other = sqlite3.connect(tmp_path / "study" / DATABASE, check_same_thread=False)
+    other.execute("BEGIN EXCLUSIVE")
+    threading.Timer(2.0, other.rollback).start()
+    started = time.monotonic()
+    study = toy.run(tmp_path / "study", max_trials=4)
+    assert time.monotonic() - started >= 1.5
+    assert len(searched(study)) == 4
+    other.close()
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.3, 0.9])
+def test_f18_torn_database_is_said_in_one_line(kept: float, tmp_path: Path) -> None:
+    toy.run(tmp_path / "study", max_trials=2)
+    database = tmp_path / "study" / DATABASE
+    whole = database.read_bytes()
+    database.write_bytes(whole[: int(kept * len(whole))] + b"torn")
+    with pytest.raises(ScilabRLError, match=r"cannot be opened: [^\n]*another study_name"):
+        Ledger(tmp_path / "study").runs()
+
+
+@pytest.mark.parametrize("value", ["nan", "infinite", "text", "nothing", "several"])
+def test_f19_score_that_is_no_number_never_wins(value: str, tmp_path: Path) -> None:
+    study = toy.run(
+        tmp_path / "study", score=f"{toy.__package__}.bad_scores.{value}", max_trials=20,
+        fail_fast=3,
+    )  # fmt: skip
+    failed = [run for run in study.runs if run.state == FAILED]
+    assert all("no finite number" in run.error for run in failed)
+    # A repeat is stopped when its setting has failed meanwhile.
+    assert {run.trial for run in study.runs} == {run.trial for run in failed}
+    assert not [run for run in study.runs if run.scores]
+    assert study.winner() is None
+    assert "first 3 runs all failed" in study.stop.reason
+    assert dict(summarize(study.ledger).facts())["best setting"] == "none: no run is complete"
+    assert not study.ledger.trials(TrialState.COMPLETE)
 
 
 @pytest.mark.slow
