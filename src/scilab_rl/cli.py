@@ -25,6 +25,7 @@ COMMANDS = {
     "profile": "train for a little while and show where the time goes",
     "study": "show what a hyperparameter study has found",
     "algorithms": "list the algorithms",
+    "performance": "test whether everything still learns as well as it did",
     "envs": "list the environments",
     "explain": "show where the value of a key comes from",
     "doctor": "check the installation and say how to repair it",

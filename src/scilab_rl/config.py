@@ -124,6 +124,8 @@ _OPEN_GROUPS = ("algorithm.", "env_kwargs.")
 _TRUSTED = (
     "scilab_rl.", "custom_algorithms.", "custom_envs.", "custom_probes.",
     "stable_baselines3.", "sb3_contrib.", "gymnasium.", "gymnasium_robotics.", "torch.nn.",
+# What the runs of a performance test have to reach; a single run does not look at it.
+CONDITIONS = "performance_testing_conditions"
 )  # fmt: skip
 _FLATTEN = {"_target_": "gymnasium.wrappers.FlattenObservation"}
 _CLIP = {"_target_": "scilab_rl.envs.clipping.ClipAction"}
@@ -270,8 +272,8 @@ def prepare(cfg: DictConfig) -> DictConfig:
     check_keys(cfg)
     with open_dict(cfg):
         cfg.wrappers = [*_aliased_wrappers(cfg), *cfg.wrappers]
-        for alias in ALIASES:
-            cfg.pop(alias, None)
+        for name in (*ALIASES, CONDITIONS):
+            cfg.pop(name, None)
     return cfg
 
 
@@ -279,7 +281,7 @@ def check_keys(cfg: DictConfig) -> None:
     """Refuse unknown keys and values of the wrong type or out of range."""
     known = {key.name: key for key in KEYS}
     for name in map(str, cfg):
-        if name not in known and name not in (*GROUPS, *ALIASES, "hydra"):
+        if name not in known and name not in (*GROUPS, *ALIASES, CONDITIONS, "hydra"):
             raise ConfigError(
                 f"There is no key '{name}'.{did_you_mean(name, [*known, *GROUPS, *ALIASES])} "
                 "`scilab-rl --help` lists all keys."

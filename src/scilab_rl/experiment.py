@@ -17,6 +17,7 @@ from omegaconf import DictConfig, OmegaConf
 from scilab_rl import config, files, provenance
 from scilab_rl.assembly import (
     complete,
+    env_settings,
     make_algorithm,
     make_environments,
     open_trackers,
@@ -27,10 +28,12 @@ from scilab_rl.errors import ConfigError, ScilabRLError, did_you_mean
 from scilab_rl.metrics.criteria import final_score
 from scilab_rl.results import CONFIG_FILE, RunDirectory, RunResult
 from scilab_rl.tracking.base import RunInfo, TrackerGroup
+from scilab_rl.seeding import derive_seed
 
 _log = logging.getLogger(__name__)
 _FALLBACK_CRITERION = "eval/mean_reward"
 
+_SMALL_BUFFER = 1000
 
 def run(
     cfg: DictConfig,
@@ -100,6 +103,33 @@ class Session:
     cfg: DictConfig
     directory: RunDirectory
     train_env: Any
+def measure(directory: RunDirectory, n_episodes: int) -> dict[str, float]:
+    """Evaluate the finished policy of a run in episodes that the run has never seen.
+
+    Args:
+        directory: The run.
+        n_episodes: How many episodes.
+
+    Returns:
+        The metrics, by the names of an evaluation.
+    """
+    from scilab_rl.envs.vectorize import make_eval_env
+    from scilab_rl.training.evaluation import evaluate
+    from scilab_rl.training.trainer import FINISHED, load_policy
+
+    cfg = complete(config.load_recorded(directory / CONFIG_FILE))
+    if "buffer_size" in cfg.algorithm:  # a policy that only acts needs no replay buffer
+        cfg.algorithm.buffer_size = min(cfg.algorithm.buffer_size, _SMALL_BUFFER)
+    env = make_eval_env(env_settings(cfg))
+    try:
+        algorithm = make_algorithm(cfg, env)
+        load_policy(algorithm, directory / FINISHED)
+        seed = derive_seed(cfg.seed, "measure")
+        return evaluate(algorithm, env, n_episodes, seed).metrics()
+    finally:
+        env.close()
+
+
     eval_env: Any
     algorithm: Any
     trainer: Any

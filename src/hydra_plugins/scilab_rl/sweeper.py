@@ -1,4 +1,4 @@
-"""Lets Hydra find our sweeper: studies go to `scilab_rl.hyperopt`, plain grids to Hydra's own."""
+"""Lets Hydra find our sweeper: for performance tests, studies, and plain grids as Hydra's own."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from omegaconf import OmegaConf
 
 
 class StudySweeper(BasicSweeper):
-    """Runs a multirun as a study when it searches, and as a grid when it lists.
+    """Runs a multirun as a performance test, as a study when it searches, as a grid when it lists.
 
     Args:
         settings: The mapping ``hydra.sweeper``.
@@ -21,7 +21,9 @@ class StudySweeper(BasicSweeper):
 
     def sweep(self, arguments: list[str]) -> Any:
         """Run all trials."""
+        from scilab_rl.config import CONDITIONS
         from scilab_rl.hyperopt import sweep
+        from scilab_rl.performance import session
 
         assert self.config is not None and self.hydra_context is not None
         sweeper = OmegaConf.to_container(self.config.hydra.sweeper, resolve=True)
@@ -29,6 +31,8 @@ class StudySweeper(BasicSweeper):
         assert isinstance(sweeper, dict) and isinstance(launcher, dict)
         parser = OverridesParser.create(config_loader=self.hydra_context.config_loader)
         overrides = parser.parse_overrides([*self._parse_config(), *arguments])
+        if CONDITIONS in self.config:
+            return session.run_from_sweep(sweeper, launcher, overrides)
         if sweep.is_study(sweeper, overrides):
             return sweep.run_study(sweeper, launcher, overrides)
         return super().sweep(arguments)

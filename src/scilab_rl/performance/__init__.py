@@ -1,0 +1,1 @@
+"""Tests that guard learning: gates with declared error rates, baselines, and comparisons."""

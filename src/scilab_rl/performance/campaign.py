@@ -1,0 +1,326 @@
+"""Trains the runs of performance tests, several at a time, until each test has its answer."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import logging
+import math
+import platform
+import signal
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from omegaconf import OmegaConf
+
+from scilab_rl import assembly, config
+from scilab_rl.errors import ScilabRLError
+from scilab_rl.hyperopt.jobs import JobPool
+from scilab_rl.hyperopt.pool import Pool, n_cores
+from scilab_rl.hyperopt.space import override_text
+from scilab_rl.hyperopt.worker import Message, Task
+from scilab_rl.performance.conditions import KEY, REFERENCE, Conditions, read_conditions
+from scilab_rl.performance.gate import OPEN
+from scilab_rl.performance.results import TestResult, TestRun, load_result
+from scilab_rl.provenance import PROVENANCE_FILE
+from scilab_rl.results import RunDirectory, read_epochs
+from scilab_rl.seeding import derive_seed
+
+_log = logging.getLogger(__name__)
+_POLL_SECONDS = 0.5
+_MOST_ATTEMPTS = 3  # when the machine, and not the run, is to blame
+_SOURCES = ("algorithms", "training", "envs", "metrics")
+# What does not change what a run learns.
+_FREE_KEYS = (
+    "seed", "base_logdir", "info", "mlflow", "wandb", "tensorboard", "project_name", "entity",
+    "group", "tags", "render", "render_freq", "device", "n_threads", "tracking",
+)  # fmt: skip
+
+
+class CampaignInterrupted(ScilabRLError):
+    """Somebody has stopped the tests; what has ended is kept."""
+
+    exit_code = 130
+
+
+@dataclass(frozen=True)
+class PerformanceTest:
+    """A test that can be run.
+
+    Attributes:
+        name: For example ``FetchReach/sac_her-test``.
+        overrides: The configuration of its runs, without the seed.
+        conditions: What they have to reach.
+        env: Id of the environment.
+        algorithm: Name of the algorithm.
+        base: The folder of all runs.
+        definition: What makes its runs comparable.
+    """
+
+    name: str
+    overrides: tuple[str, ...]
+    conditions: Conditions
+    env: str
+    algorithm: str
+    base: Path
+    definition: Mapping[str, Any]
+
+    def task(self, number: int) -> Task:
+        """Return the training run of this number."""
+        judged_apart = self.conditions.rule != REFERENCE
+        return Task(
+            (*self.overrides, f"seed={self.seed(number)}"),
+            self.conditions.eval_columns,
+            n_final_episodes=self.conditions.n_episodes if judged_apart else 0,
+        )
+
+    def seed(self, number: int) -> int:
+        """Return the seed of a run: the same at each time, so that results can be paired."""
+        return derive_seed(self.conditions.seed, "performance", number)
+
+
+def read_test(
+    name: str, overrides: Sequence[str], changes: Mapping[str, Any] | None = None
+) -> PerformanceTest:
+    """Compose and check a test; nothing is started.
+
+    Must run inside a Hydra application, or inside ``hydra.initialize...``.
+
+    Args:
+        name: Of the test.
+        overrides: All that is on the command line, with ``+performance=NAME``.
+        changes: Conditions that win over those of the file.
+
+    Raises:
+        ConfigError: If the test cannot work.
+    """
+    cfg = config.compose(overrides)
+    given = OmegaConf.to_container(cfg[KEY], resolve=True)
+    if isinstance(given, list) and given:
+        given = given[0]
+    if isinstance(given, dict):
+        given = {**given, **(changes or {})}
+    conditions = read_conditions(given, name)
+    cfg = assembly.complete(cfg)
+    epoch_steps = min(cfg.eval_after_n_steps, conditions.max_steps)
+    fixed = (
+        f"eval_after_n_steps={epoch_steps}",
+        f"n_epochs={math.ceil(conditions.max_steps / epoch_steps)}",
+        f"early_stop_data_column={conditions.eval_columns}",
+        f"early_stop_threshold={conditions.stop_value:.12g}",
+        f"hyperopt_criterion={conditions.eval_columns}",
+        f"group={cfg.group or name.replace('/', '_')}",
+        "++tracking.console.enabled=false",  # many runs at once: the tests report for them
+    )
+    definition = {
+        "conditions": dataclasses.asdict(conditions),
+        "configuration": {
+            key: override_text(value)
+            for key, value in config.flat(cfg).items()
+            if key.partition(".")[0] not in _FREE_KEYS
+        },
+        "code": code_digest(),
+    }
+    return PerformanceTest(
+        name, (*overrides, *fixed), conditions, cfg.env, cfg.algorithm.name, Path(cfg.base_logdir),
+        json.loads(json.dumps(definition)),
+    )  # fmt: skip
+
+
+def code_digest() -> str:
+    """Return a digest of the code that decides what a run learns, of the framework and the desk."""
+    package = Path(__file__).parents[1]
+    folders = [package / name for name in _SOURCES]
+    folders += [Path("src/custom_algorithms"), Path("src/custom_envs")]
+    digest = hashlib.sha256()
+    for path in sorted(path for folder in folders for path in folder.rglob("*.py")):
+        digest.update(path.name.encode() + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+class Campaign:
+    """Runs tests.
+
+    Args:
+        tests: The tests; the same command again continues them.
+        pool: Where runs are trained.
+        fresh: Whether to begin anew, whatever is known.
+        any_code: Whether runs count that earlier code has trained.
+    """
+
+    def __init__(
+        self,
+        tests: Sequence[PerformanceTest],
+        pool: Pool | JobPool,
+        *,
+        fresh: bool = False,
+        any_code: bool = False,
+    ) -> None:
+        self.tests = tests
+        self.pool = pool
+        self.rules = [test.conditions.make_rule() for test in tests]
+        self.results = [_remembered(test, fresh, any_code) for test in tests]
+        self.signal_number = 0
+        self._running: dict[int, tuple[int, int]] = {}  # job -> test, run
+        self._folders: dict[int, str] = {}
+        self._attempts: dict[tuple[int, int], int] = {}
+        self._n_jobs = 0
+
+    def work(self) -> list[TestResult]:
+        """Train until every test has its answer.
+
+        Returns:
+            The results, in the order of the tests.
+
+        Raises:
+            CampaignInterrupted: If a signal has stopped it.
+        """
+        with _signals_to(self):
+            while not self.signal_number and (self._submit() or self._running):
+                for job, message in self.pool.messages(_POLL_SECONDS):
+                    self._handle(job, message)
+        if self.signal_number:
+            self.pool.kill_all()
+            raise CampaignInterrupted("Interrupted; the same command continues the tests.")
+        return self.results
+
+    def is_open(self, index: int) -> bool:
+        """Tell whether a test needs more runs."""
+        return self.results[index].verdict(self.rules[index]).outcome == OPEN
+
+    def _submit(self) -> bool:
+        """Fill the pool; return whether anything is left to be done."""
+        while self.pool.has_room() and (wanted := self._next_run()) is not None:
+            index, number = wanted
+            self._running[self._n_jobs] = wanted
+            self.pool.submit(self._n_jobs, self.tests[index].task(number))
+            self._n_jobs += 1
+        return any(map(self.is_open, range(len(self.tests))))
+
+    def _next_run(self) -> tuple[int, int] | None:
+        """Return test and number of the run to train next.
+
+        Other tests come before a second run of the same one, whose first may suffice.
+        """
+        under_way = list(self._running.values())
+        candidates = []
+        for index, result in enumerate(self.results):
+            taken = {number for test, number in under_way if test == index} | set(result.runs)
+            number = next(i for i in range(len(taken) + 1) if i not in taken)
+            if self.is_open(index) and number < self.rules[index].max_runs:
+                n_beside = sum(test == index for test, _ in under_way)
+                candidates.append((n_beside, index, number))
+        return min(candidates)[1:] if candidates else None
+
+    def _handle(self, job: int, message: Message) -> None:
+        index, number = self._running[job]
+        if message.kind == "evaluated":
+            self.pool.answer(job, self.is_open(index))
+        elif message.kind == "started":
+            self._folders[job] = message.content["run_dir"]
+        else:
+            del self._running[job]
+            self._end(index, number, self._folders.pop(job, ""), message)
+
+    def _end(self, index: int, number: int, folder: str, message: Message) -> None:
+        test, result = self.tests[index], self.results[index]
+        if not self.is_open(index):
+            return  # it was one too many
+        if message.kind == "finished":
+            run = _finished_run(test, number, message.content)
+        else:
+            attempts = self._attempts[index, number] = self._attempts.get((index, number), 0) + 1
+            blameless = message.kind == "died" or message.content.get("machine")
+            if blameless and attempts < _MOST_ATTEMPTS:
+                return  # its number is free again
+            error = str(message.content["error"])
+            run = TestRun(number, test.seed(number), run_dir=folder, error=error)
+        result.runs[number] = run
+        if not result.source and run.run_dir:
+            result.source = read_source(Path(run.run_dir))
+        result.save(test.base)
+        self._tell(index, run)
+
+    def _tell(self, index: int, run: TestRun) -> None:
+        test = self.tests[index]
+        verdict = self.results[index].verdict(self.rules[index])
+        told = f"{run.value:.3g}" if run.value is not None else f"FAILED: {run.error}"
+        _log.info(
+            "%s, run %d: %s after %s steps and %.0f s. Mean %.3g of %d, %.3g needed: %s.",
+            test.name, run.number + 1, told, f"{run.steps:,}", run.seconds, verdict.mean,
+            verdict.n_runs, test.conditions.eval_value, verdict.outcome,
+        )  # fmt: skip
+
+
+def read_source(run_dir: Path) -> dict[str, Any]:
+    """Return where a run comes from: versions, fingerprint, commit and machine."""
+    try:
+        stored = json.loads((run_dir / PROVENANCE_FILE).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        stored = {}
+    kept = ("git_commit", "git_changed", "fingerprint", "python", "platform", "versions")
+    return {
+        **{key: stored.get(key) for key in kept},
+        "machine": {"processor": _processor(), "cores": n_cores()},
+    }
+
+
+def _remembered(test: PerformanceTest, fresh: bool, any_code: bool) -> TestResult:
+    new = TestResult(test.name, test.definition)
+    known = None if fresh else load_result(test.name, test.base)
+    if known is None:
+        return new
+    changed = [key for key in test.definition if known.definition.get(key) != test.definition[key]]
+    if any_code and changed == ["code"]:
+        changed = []
+    if changed:
+        _log.info("%s: its %s changed; it begins anew.", test.name, " and ".join(changed))
+        return new
+    known.runs = {n: run for n, run in known.runs.items() if run.value is not None}
+    return known
+
+
+def _finished_run(test: PerformanceTest, number: int, content: Mapping[str, Any]) -> TestRun:
+    rows = read_epochs(RunDirectory(Path(content["run_dir"])))
+    training = math.fsum(row.get("time/train_seconds", 0.0) for row in rows)
+    final = content.get("final")
+    steps = content["steps"][-1] if content["steps"] else 0
+    return TestRun(
+        number=number,
+        seed=test.seed(number),
+        value=content["values"][-1] if final is None else final,
+        steps=steps,
+        seconds=round(content["seconds"], 1),
+        steps_per_second=round(steps / training, 2) if training else None,
+        curve_steps=tuple(content["steps"]),
+        curve=tuple(round(value, 4) for value in content["values"]),
+        run_dir=content["run_dir"],
+    )
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model n"))
+    except (OSError, StopIteration):
+        return platform.processor() or platform.machine()
+
+
+@contextlib.contextmanager
+def _signals_to(campaign: Campaign) -> Iterator[None]:
+    """Let Ctrl-C and SIGTERM stop the tests politely while the block runs."""
+
+    def stop(number: int, _: Any) -> None:
+        campaign.signal_number = number
+
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    previous = {number: signal.signal(number, stop) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
