@@ -204,16 +204,18 @@ class Campaign:
     def _next_run(self) -> tuple[int, int] | None:
         """Return test and number of the run to train next.
 
-        Other tests come before a second run of the same one, whose first may suffice.
+        Tests are brought to their answer one after the other; a run that may turn out to be one too
+        many comes after those that are needed for certain.
         """
         under_way = list(self._running.values())
+        busy = {test for test, _ in under_way}
         candidates = []
         for index, result in enumerate(self.results):
             taken = {number for test, number in under_way if test == index} | set(result.runs)
             number = next(i for i in range(len(taken) + 1) if i not in taken)
             if self.is_open(index) and number < self.rules[index].max_runs:
-                n_beside = sum(test == index for test, _ in under_way)
-                candidates.append((n_beside, index, number))
+                is_certain = number < self.rules[index].min_runs or index not in busy
+                candidates.append((not is_certain, index, number))
         return min(candidates)[1:] if candidates else None
 
     def _handle(self, job: int, message: Message) -> None:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -43,9 +43,18 @@ class Verdict:
 
 
 class Rule(Protocol):
-    """Decides from the runs of one test, or of many simulated tests at once."""
+    """Decides from the runs of one test, or of many simulated tests at once.
 
-    max_runs: int
+    Attributes:
+        min_runs: So many runs are needed in any case.
+        max_runs: The budget.
+    """
+
+    @property
+    def min_runs(self) -> int: ...  # noqa: D102
+
+    @property
+    def max_runs(self) -> int: ...  # noqa: D102
 
     def outcomes(self, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the outcome of each test and how many runs it used.
@@ -154,6 +163,12 @@ class BoundedTest:
     alpha: float = 0.05
     max_runs: int = 40
 
+    @property
+    def min_runs(self) -> int:
+        """Return after how many perfect runs the larger of the two bets can be won."""
+        best = max(-math.log(self.required - self.margin), -math.log(1 - self.required))
+        return math.ceil(-math.log(self.alpha) / best)
+
     def outcomes(self, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the outcome of each test and how many runs it used; see `Rule`."""
         runs = runs[:, : self.max_runs]
@@ -183,7 +198,11 @@ class ReferenceRule:
     required: float
     succ_runs: int = 2
     max_runs: int = 3
-    margin: float = field(default=0.0, init=False)
+
+    @property
+    def min_runs(self) -> int:
+        """Return after how many runs it can pass or fail."""
+        return min(self.succ_runs, self.max_runs - self.succ_runs + 1)
 
     def outcomes(self, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the outcome of each test and how many runs it used; see `Rule`."""
