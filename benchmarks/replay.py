@@ -23,6 +23,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -107,7 +108,7 @@ def fill(buffers: dict[str, Any], env: VecEnv, n_steps: int, results: Results) -
     times: dict[str, list[float]] = {name: [] for name in buffers}
     for step in episodes(env, n_steps):
         for name, buffer in buffers.items():
-            times[name].append(timed(lambda buffer=buffer, step=step: buffer.add(*step)))
+            times[name].append(timed(partial(buffer.add, *step)))
     for name, values in times.items():
         results[name]["add_ms"] = 1e3 * statistics.median(values)
 
@@ -118,7 +119,7 @@ def time_sampling(buffers: dict[str, Any], batch_size: int, results: Results) ->
     for _ in range(3):
         for name in (*buffers, *reversed(buffers)):
             buffer = buffers[name]
-            times[name] += [timed(lambda: buffer.sample(batch_size)) for _ in range(N_DRAWS)]  # noqa: B023
+            times[name] += [timed(partial(buffer.sample, batch_size)) for _ in range(N_DRAWS)]
     n_new = batch_size * 4 // 5
     goals = np.random.default_rng(1).normal(size=(2, n_new, 3))
     judge = {
