@@ -117,6 +117,8 @@ KEYS = (
     Key("n_threads", WHOLE, "CPU threads of PyTorch; 1 is fastest for small networks", low=1),
 )
 GROUPS = ("algorithm", "tracking")
+# What the runs of a performance test have to reach; a single run does not look at it.
+CONDITIONS = "performance_testing_conditions"
 # Parts of the configuration that are dictionaries: their keys can be added without Hydra's plus.
 _OPEN_GROUPS = ("algorithm.", "env_kwargs.")
 
@@ -124,8 +126,6 @@ _OPEN_GROUPS = ("algorithm.", "env_kwargs.")
 _TRUSTED = (
     "scilab_rl.", "custom_algorithms.", "custom_envs.", "custom_probes.",
     "stable_baselines3.", "sb3_contrib.", "gymnasium.", "gymnasium_robotics.", "torch.nn.",
-# What the runs of a performance test have to reach; a single run does not look at it.
-CONDITIONS = "performance_testing_conditions"
 )  # fmt: skip
 _FLATTEN = {"_target_": "gymnasium.wrappers.FlattenObservation"}
 _CLIP = {"_target_": "scilab_rl.envs.clipping.ClipAction"}

@@ -27,13 +27,13 @@ from scilab_rl.assembly import (
 from scilab_rl.errors import ConfigError, ScilabRLError, did_you_mean
 from scilab_rl.metrics.criteria import final_score
 from scilab_rl.results import CONFIG_FILE, RunDirectory, RunResult
-from scilab_rl.tracking.base import RunInfo, TrackerGroup
 from scilab_rl.seeding import derive_seed
+from scilab_rl.tracking.base import RunInfo, TrackerGroup
 
 _log = logging.getLogger(__name__)
 _FALLBACK_CRITERION = "eval/mean_reward"
-
 _SMALL_BUFFER = 1000
+
 
 def run(
     cfg: DictConfig,
@@ -96,13 +96,6 @@ def resume(
         return session.learn(resumed_step=step)
 
 
-@dataclass
-class Session:
-    """Everything that takes part in a run, built and not yet started."""
-
-    cfg: DictConfig
-    directory: RunDirectory
-    train_env: Any
 def measure(directory: RunDirectory, n_episodes: int) -> dict[str, float]:
     """Evaluate the finished policy of a run in episodes that the run has never seen.
 
@@ -130,6 +123,13 @@ def measure(directory: RunDirectory, n_episodes: int) -> dict[str, float]:
         env.close()
 
 
+@dataclass
+class Session:
+    """Everything that takes part in a run, built and not yet started."""
+
+    cfg: DictConfig
+    directory: RunDirectory
+    train_env: Any
     eval_env: Any
     algorithm: Any
     trainer: Any
