@@ -6,9 +6,13 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
+import time
+import urllib.request
 from pathlib import Path
 
+import psutil
 import pytest
 
 from .commands import ROOT, TINY, command, config_of, quiet_environment, scilab_rl
@@ -85,6 +89,72 @@ def test_trains_with_the_winner(finished: Path) -> None:
     config = config_of((finished / "data" / "last").resolve())
     assert winner == f"++algorithm.gamma={config['algorithm']['gamma']}"
     assert (config["seed"], config["n_epochs"]) == (3, 1)
+
+
+def test_dashboard_opens_on_the_loopback_only(finished: Path) -> None:
+    pytest.importorskip("optuna_dashboard")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    process = subprocess.Popen(
+        command("study", "mine", "--dashboard", "--port", str(port)),
+        cwd=finished, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
+        env=quiet_environment(),
+    )  # fmt: skip
+    try:
+        page = fetch(f"http://127.0.0.1:{port}/api/studies", process)
+        addresses = {
+            connection.laddr.ip
+            for connection in psutil.Process(process.pid).net_connections()
+            if connection.status == psutil.CONN_LISTEN
+        }
+    finally:
+        process.terminate()
+        process.wait(20)
+    assert [study["study_name"] for study in json.loads(page)["study_summaries"]] == ["mine"]
+    assert addresses == {"127.0.0.1"}
+
+
+def fetch(url: str, process: subprocess.Popen) -> str:
+    """Return what a server says as soon as it is there."""
+    deadline = time.monotonic() + 60
+    while True:
+        try:
+            return urllib.request.urlopen(url, timeout=5).read().decode()
+        except OSError:
+            assert process.poll() is None and time.monotonic() < deadline
+            time.sleep(0.2)
+
+
+@pytest.mark.slow
+def test_submitit_finds_the_same_as_this_machine(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    found = []
+    for launcher in ("local", "submitit_local"):
+        done = scilab_rl(
+            *TINY_RUNS, GAMMA, "--multirun", "hydra.sweeper.max_trials=2", "hydra.sweeper.seed=5",
+            "hydra.sweeper.min_trials_per_param=1", "hydra.sweeper.n_final_runs=1",
+            f"hydra.sweeper.study_name={launcher}", f"hydra/launcher={launcher}", cwd=tmp_path,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stderr
+        runs = runs_of(study_of(tmp_path, launcher))
+        found.append([(run.seed, run.values, run.scores) for run in runs])
+    assert found[0] == found[1]
+
+
+@pytest.mark.slow
+def test_grid_by_submitit_runs_each_combination_once_and_says_what_failed(tmp_path: Path) -> None:
+    pytest.importorskip("submitit")
+    done = scilab_rl(
+        *TINY_RUNS, "algorithm.learning_starts=10", "algorithm.batch_size=16", "seed=1",
+        "algorithm.learning_rate=0.001,1e30", "--multirun", "hydra/launcher=submitit_local",
+        cwd=tmp_path,
+    )  # fmt: skip
+    assert done.returncode == 3, done.stderr
+    assert "1 of 2 runs failed" in done.stderr
+    assert "): FAILED: " in done.stderr
+    results = [json.loads(p.read_text())["status"] for p in tmp_path.glob("data/*/*/result.json")]
+    assert sorted(results) == ["failed", "finished"]
 
 
 @pytest.mark.slow

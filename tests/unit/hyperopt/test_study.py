@@ -124,8 +124,9 @@ def test_f19_ends_early_when_the_first_runs_fail_alike(tmp_path: Path) -> None:
     assert study.winner() is None
 
 
-def test_hopeless_runs_are_pruned_and_their_settings_are_out(tmp_path: Path) -> None:
-    study = toy.run(tmp_path / "study", max_trials=26, pruner="median", pruner_warmup_epochs=1)
+@pytest.mark.parametrize("pruner", ["median", "percentile", "hyperband"])
+def test_hopeless_runs_are_pruned_and_their_settings_are_out(pruner: str, tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", max_trials=26, pruner=pruner, pruner_warmup_epochs=1)
     pruned = [run for run in study.runs if run.state == PRUNED]
     assert pruned
     assert all(1 < len(run.values) < toy.N_EPOCHS for run in pruned if run.repeat == 0)
