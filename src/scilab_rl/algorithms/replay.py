@@ -10,6 +10,10 @@ take the place of Stable-Baselines3's ``HerReplayBuffer``, from which it differs
 * Each transition is relabelled with probability k / (k + 1), in one vectorised call for any number
   of batches, and the chance comes from a generator of its own.
 * Goals may also be drawn from all episodes (``random``), and may change within an episode.
+* Episodes in which the achieved goal moved may be preferred (``moved_share``): where an object lies
+  still, every goal of the episode is the same, and there is nothing to learn about pushing it. That
+  is the coarsest form of Zhao and Tresp, 2018, "Energy-Based Hindsight Experience Prioritization",
+  arXiv 1810.01363.
 """
 
 from __future__ import annotations
@@ -29,6 +33,9 @@ from scilab_rl.algorithms.goal_functions import goal_reward, goal_termination
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 
 GOAL_STRATEGIES = ("future", "final", "episode", "random")
+# An achieved goal that stays within this range in every dimension has not moved (metres).
+_REST = 0.01
+_MOST_REDRAWS = 50  # then a still episode will do
 # Rows of `HindsightReplayBuffer._cursors`.
 _OLDEST, _START, _NOW = range(3)
 _MIN_ROWS = 4
@@ -84,6 +91,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
         goal_selection_strategy: Which goals are put in: ``future``, one that is reached from this
             step on in the same episode; ``final``, the one reached at its end; ``episode``, any of
             it; ``random``, any of all episodes. In the paper ``future`` does best, with k = 4 or 8.
+        moved_share: Share of transitions that are drawn only from episodes in which the achieved
+            goal moved, as far as there are any; the others are drawn from all.
         info_keys: Numbers in the infos of steps that reward or ending depend on besides the goals.
         seed: Of the generator; None: drawn from NumPy's global one, which the run has seeded.
 
@@ -103,12 +112,13 @@ class HindsightReplayBuffer(HerReplayBuffer):
         *,
         n_sampled_goal: int = 4,
         goal_selection_strategy: str = "future",
+        moved_share: float = 0.0,
         info_keys: Sequence[str] = (),
         seed: int | None = None,
     ) -> None:
         # What Stable-Baselines3's own classes allocate is not wanted.
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
-        _check(observation_space, n_sampled_goal, goal_selection_strategy)
+        _check(observation_space, n_sampled_goal, goal_selection_strategy, moved_share)
         n_rows = max(buffer_size // n_envs, _MIN_ROWS)
         self.buffer_size = n_rows
         self.env = env
@@ -116,6 +126,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
         self.handle_timeout_termination = True
         self.n_sampled_goal = n_sampled_goal
         self.strategy = goal_selection_strategy
+        self.moved_share = moved_share
         self.info_keys = tuple(info_keys)
         self.her_ratio = 1 - 1 / (n_sampled_goal + 1)
         self.random = np.random.default_rng(
@@ -134,6 +145,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
         # Steps from the beginning of the episode to this row, and from here to its last row.
         self.steps_before = np.zeros((n_rows, n_envs), np.int32)
         self.steps_left = np.zeros((n_rows, n_envs), np.int32)
+        self.moved = np.zeros((n_rows, n_envs), bool)
         # Rows are counted without end; modulo n_rows it is where they lie. The oldest episode's
         # first row, the running episode's first row, and the row where it is now.
         self._cursors = np.zeros((3, n_envs), np.int64)
@@ -284,6 +296,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
             rows = np.arange(start[index], now[index] + 1) % self.buffer_size
             self.steps_before[rows, index] = np.arange(length + 1)
             self.steps_left[rows, index] = np.arange(length, -1, -1)
+            reached = self.rows[rows, index, self._columns["achieved_goal"]]
+            self.moved[rows, index] = np.ptp(reached, axis=0).max() > _REST
             now[index] += 1
             start[index] = now[index]
 
@@ -323,13 +337,21 @@ class HindsightReplayBuffer(HerReplayBuffer):
             )
         cells = np.empty(n, np.int64)
         missing = np.arange(n)
+        n_redraws = 0
+        picky = np.zeros(n, bool)
+        if self.moved_share and self.moved.any():
+            picky = self.random.random(n) < self.moved_share
         while len(missing):
             drawn = self.random.integers(ends[-1], size=len(missing))
             env = np.searchsorted(ends, drawn, side="right")
             row = drawn - ends[env] + start[env]
             cells[missing] = row % self.buffer_size * self.n_envs + env
             # The last row of an episode begins no transition.
-            missing = missing[self.steps_left.reshape(-1)[cells[missing]] == 0]
+            refused = self.steps_left.reshape(-1)[cells[missing]] == 0
+            if n_redraws < _MOST_REDRAWS:
+                refused |= picky[missing] & ~self.moved.reshape(-1)[cells[missing]]
+            missing = missing[refused]
+            n_redraws += 1
         return cells
 
     def _draw_goals(self, cells: np.ndarray) -> np.ndarray:
@@ -379,7 +401,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
         return self._to_vectors(normalized, len(vectors))
 
 
-def _check(space: spaces.Space, n_sampled_goal: int, strategy: str) -> None:
+def _check(space: spaces.Space, n_sampled_goal: int, strategy: str, moved_share: float) -> None:
     if not can_hold(space):
         raise ConfigError(
             "This replay buffer needs Dict observations of floating-point arrays with observation, "
@@ -389,6 +411,11 @@ def _check(space: spaces.Space, n_sampled_goal: int, strategy: str) -> None:
         raise ConfigError(
             "algorithm.replay_buffer_kwargs.n_sampled_goal must be at least 0, but it is "
             f"{n_sampled_goal}."
+        )
+    if not 0 <= moved_share <= 1:
+        raise ConfigError(
+            "algorithm.replay_buffer_kwargs.moved_share must be from 0 to 1, but it is "
+            f"{moved_share}."
         )
     if strategy not in GOAL_STRATEGIES:
         raise ConfigError(

@@ -537,3 +537,32 @@ def test_auto_is_this_buffer_and_her_is_stable_baselines3s(
     model.learn(60)
     assert type(build("auto").replay_buffer).__name__ == "HindsightReplayBuffer"
     assert model.replay_buffer.sample(8).actions.shape == (8, 2)
+
+
+def still(episode: int, step: int) -> dict[str, np.ndarray]:
+    """An observation of an episode in which nothing moves."""
+    entries = observation(0, episode, step) | {"achieved_goal": [100.0 * episode]}
+    return {key: np.array([value]) for key, value in entries.items()}
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.0, 0.25), (0.6, 0.7), (1.0, 1.0)])
+def test_episodes_that_moved_something_are_preferred(share: float, expected: float) -> None:
+    buffer = make(moved_share=share)
+    for episode in (1, 2, 3):  # nothing moves in three of four episodes
+        for step in range(5):
+            place = still(episode, step), still(episode, step + 1)
+            buffer.add(*place, np.zeros((1, 2)), np.zeros(1), np.array([step == 4]), [{}])
+    record(buffer, [5], first=4)
+    drawn = buffer.sample_arrays(4000).observations[:, :1]  # the achieved goal: 100 episode + step
+    preferred = (drawn >= 400).mean()
+    assert preferred == pytest.approx(expected, abs=0.03)
+
+
+def test_preferring_what_does_not_exist_draws_from_all() -> None:
+    buffer = make(moved_share=1.0)
+    for step in range(5):
+        place = still(1, step), still(1, step + 1)
+        buffer.add(*place, np.zeros((1, 2)), np.zeros(1), np.array([step == 4]), [{}])
+    assert len(buffer.sample_arrays(10).rewards) == 10
+    with pytest.raises(ConfigError, match=r"moved_share must be from 0 to 1, but it is 1\.5"):
+        make(moved_share=1.5)
