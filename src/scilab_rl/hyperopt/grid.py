@@ -38,7 +38,7 @@ def run(launcher: Mapping[str, Any], grid: Sequence[Sequence[str]], cfg: DictCon
         assembly.complete(config.compose(task.overrides))
     failures = []
     with open_pool(launcher, cfg.hydra.sweeper.n_jobs, Path(cfg.hydra.sweep.dir)) as pool:
-        for number, message in _outcomes(pool, tasks):
+        for number, message in outcomes(pool, tasks):
             words = " ".join(tasks[number].overrides)
             if message.kind == "finished":
                 _log.info("run %d (%s): %s", number, words, message.content["run_dir"])
@@ -51,7 +51,7 @@ def run(launcher: Mapping[str, Any], grid: Sequence[Sequence[str]], cfg: DictCon
         )
 
 
-def _outcomes(pool: Pool | JobPool, tasks: Sequence[Task]) -> Iterator[tuple[int, Message]]:
+def outcomes(pool: Pool | JobPool, tasks: Sequence[Task]) -> Iterator[tuple[int, Message]]:
     """Yield the last message of each run, as they come."""
     waiting = list(enumerate(tasks))
     while waiting or pool.n_busy:

@@ -61,7 +61,7 @@ class StudyProgress:
     def update(self, runs: Sequence[Run]) -> None:
         """Tell what has changed."""
         if self._n_before is None:
-            self._n_before = sum(run.state in _MARKS for run in runs)
+            self._n_before = sum(run.state in _MARKS and not run.is_final for run in runs)
         for run in runs:
             if self._told.get(run.number) != run.state and run.state in _MARKS:
                 self._say(_line(run))
@@ -70,8 +70,9 @@ class StudyProgress:
             self._live.update(Group(*map(Text, self._state(runs))))
 
     def _state(self, runs: Sequence[Run]) -> list[str]:
-        ended = sum(run.state in _MARKS and run.state != LOST for run in runs)
-        lines = [f"{ended} of {self.settings.max_trials} runs, {self._time_left(runs)}"]
+        searched = [run for run in runs if not run.is_final]  # what max_trials counts
+        ended = sum(run.state in _MARKS and run.state != LOST for run in searched)
+        lines = [f"{ended} of {self.settings.max_trials} runs, {self._time_left(searched)}"]
         best = self._best(runs)
         if best:
             lines.append(f"best so far: {best}")
