@@ -93,7 +93,9 @@ def draw(rows: list[dict[str, Any]]) -> None:
         for name in RULES:
             of_it = [row for row in rows if row["world"] == world and row["rule"] == name]
             rates = [row["true_rate"] for row in of_it]
-            axis.plot(rates, [r["pass"] for r in of_it], "o-", ms=3, color=COLOURS[name], label=name)
+            axis.plot(
+                rates, [r["pass"] for r in of_it], "o-", ms=3, color=COLOURS[name], label=name
+            )
         axis.axvspan(REQUIRED - MARGIN, REQUIRED, color="0.93", zorder=0)
         axis.axhline(0.05, color="0.6", lw=0.8, ls=":")
         axis.axhline(0.9, color="0.6", lw=0.8, ls=":")

@@ -1,0 +1,217 @@
+"""The sides of a comparison: which runs a word of the command line means, and their curves."""
+
+from __future__ import annotations
+
+import glob
+import json
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from scilab_rl.errors import ConfigError, did_you_mean, listing
+from scilab_rl.hyperopt.folders import STUDIES, study_names
+from scilab_rl.results import CONFIG_FILE, RunDirectory, all_runs, find_run, read_epochs
+
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+FAILED, UNFINISHED = "failed", ("running", "interrupted")
+# What does not change what a run learns or how it is measured.
+_FREE_KEYS = (
+    "seed", "base_logdir", "info", "mlflow", "wandb", "tensorboard", "project_name", "entity",
+    "group", "tags", "render", "render_freq", "render_metrics_train", "render_metrics_test",
+    "device", "n_threads", "tracking", "save_model_freq", "viewer_host", "record_when",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a comparison knows about a run.
+
+    Attributes:
+        path: Its folder.
+        task: Environment and its arguments: only runs of the same task are compared.
+        env: Id of the environment.
+        algorithm: Name of the algorithm.
+        seed: Its seed.
+        status: As in ``result.json``; ``failed`` also when there is none.
+        steps: Steps at each evaluation.
+        values: Metric name to its values. Shapes: as ``steps``, shorter where it was not measured.
+        budget: Steps that it was meant to take.
+        seconds: Wall time.
+        config: What it was told, without what does not matter.
+        group: The group that it was given.
+        tags: Its tags.
+    """
+
+    path: Path
+    task: str
+    env: str
+    algorithm: str
+    seed: int
+    status: str
+    steps: tuple[int, ...]
+    values: Mapping[str, tuple[float, ...]]
+    budget: int
+    seconds: float
+    config: Mapping[str, str]
+    group: str | None = None
+    tags: tuple[str, ...] = ()
+
+    @property
+    def end(self) -> int:
+        """Steps that its curve is known for: a run that stopped early stays where it was."""
+        if self.status == "stopped_early":
+            return max(self.budget, self.steps[-1] if self.steps else 0)
+        return self.steps[-1] if self.steps else 0
+
+
+@dataclass(frozen=True)
+class Group:
+    """One side of a comparison.
+
+    Attributes:
+        label: The word that it was asked for by.
+        meaning: What the word was found to mean.
+        runs: Its runs.
+    """
+
+    label: str
+    meaning: str
+    runs: tuple[RunRecord, ...] = field(repr=False)
+
+
+def find_group(word: str, records: Callable[[], list[RunRecord]], base: Path) -> Group:
+    """Return the runs that a word means.
+
+    It is tried as a pattern of run names (with ``*``), a study, a group, an algorithm, a tag, and a
+    run, in this order.
+
+    Args:
+        word: What the user typed; ``label=word`` gives it another name.
+        records: Returns all runs; called once when needed.
+        base: Where runs live.
+
+    Raises:
+        ConfigError: If nothing fits.
+    """
+    label, separator, rest = word.partition("=")
+    label, word = (label, rest) if separator and rest else (word, word)
+    if any(sign in word for sign in "*?["):
+        return _by_pattern(label, word, records, base)
+    if word in study_names(base):
+        return _of_study(label, word, base)
+    meanings: tuple[tuple[str, Callable[[RunRecord], bool]], ...] = (
+        ("group", lambda run: run.group == word),
+        ("algorithm", lambda run: run.algorithm == word),
+        ("tag", lambda run: word in run.tags),
+    )
+    everything = records()
+    for meaning, fits in meanings:
+        found = tuple(run for run in everything if fits(run))
+        if found:
+            return Group(label, f"{meaning} {word}", found)
+    try:
+        run = find_run(word, base)
+    except ConfigError as error:
+        names = {run.algorithm for run in everything} | {r.group for r in everything if r.group}
+        raise ConfigError(
+            f"'{word}' is no study, group, algorithm, tag or run in '{base}'."
+            f"{did_you_mean(word, names)} There are: {listing(names) or 'none'}."
+        ) from error
+    record = read_record(run)
+    if record is None:
+        raise ConfigError(f"The files of the run '{run}' cannot be read.")
+    return Group(label, "run", (record,))
+
+
+def read_records(base: Path) -> list[RunRecord]:
+    """Return all runs below a folder whose configuration can be read, the oldest first."""
+    return [record for run in all_runs(base) if (record := read_record(run)) is not None]
+
+
+def read_record(run: RunDirectory) -> RunRecord | None:
+    """Return what is known about a run, or None when its configuration is damaged."""
+    try:
+        config = yaml.load((run / CONFIG_FILE).read_text(encoding="utf-8"), Loader=_LOADER)
+        algorithm, env = config["algorithm"]["name"], config["env"]
+        budget = config["n_epochs"] * config["eval_after_n_steps"]
+    except (OSError, ValueError, TypeError, KeyError, yaml.YAMLError):
+        return None
+    result, rows = run.read_result(), read_epochs(run)
+    kwargs = config.get("env_kwargs") or {}
+    status = FAILED if result is None else result.status
+    if status == "running" and not run.is_in_use():
+        status = FAILED  # its process is gone
+    names = {name for row in rows for name in row if name.startswith(("eval/", "time/train_s"))}
+    return RunRecord(
+        path=run.path,
+        task=env if not kwargs else f"{env} {json.dumps(kwargs, sort_keys=True)}",
+        env=env,
+        algorithm=algorithm,
+        seed=config.get("seed", 0),
+        status=status,
+        steps=tuple(row["step"] for row in rows),
+        values={n: tuple(row[n] for row in rows if n in row) for n in sorted(names)},
+        budget=budget,
+        seconds=result.seconds if result is not None else 0.0,
+        config=identity_of(config),
+        group=config.get("group"),
+        tags=tuple(config.get("tags") or ()),
+    )
+
+
+def identity_of(config: Any) -> dict[str, str]:
+    """Return what makes a run what it is, as one level of keys: all but seed, names and places."""
+    return {k: v for k, v in _flat(config) if k.partition(".")[0] not in _FREE_KEYS}
+
+
+def _by_pattern(
+    label: str, pattern: str, records: Callable[[], list[RunRecord]], base: Path
+) -> Group:
+    paths = {Path(path).resolve() for path in glob.glob(pattern)}  # noqa: PTH207 - also absolute
+    wanted = pattern.rstrip("/")
+    found = tuple(
+        run
+        for run in records()
+        if run.path.resolve() in paths or run.path.match(wanted) or _named(run, wanted)
+    )
+    found = found or tuple(
+        record
+        for path in sorted(paths)
+        if (path / CONFIG_FILE).is_file() and (record := read_record(RunDirectory(path)))
+    )
+    if not found:
+        raise ConfigError(f"No run in '{base}' fits '{pattern}'.")
+    return Group(label, f"runs {pattern}", found)
+
+
+def _named(run: RunRecord, pattern: str) -> bool:
+    from fnmatch import fnmatchcase
+
+    words = (run.algorithm, run.group or "", *run.tags)
+    return any(fnmatchcase(word, pattern) for word in words if word)
+
+
+def _of_study(label: str, name: str, base: Path) -> Group:
+    """Return the runs of a study's winner: those on seeds that the search never saw, if any."""
+    from scilab_rl.hyperopt.ledger import open_ledger
+    from scilab_rl.hyperopt.summary import summarize
+
+    summary = summarize(open_ledger(base / STUDIES / name))
+    if summary.winner is None:
+        raise ConfigError(f"The study {name} has no winner yet, so there is nothing to compare.")
+    of_winner = [run for run in summary.runs if run.trial == summary.winner.number and run.run_dir]
+    unseen = [run for run in of_winner if run.is_final]
+    found = (read_record(RunDirectory(Path(run.run_dir))) for run in unseen or of_winner)
+    seeds = "seeds that the search never saw" if unseen else "the seeds of the search, flattering"
+    return Group(label, f"winner of study {name}, {seeds}", tuple(r for r in found if r))
+
+
+def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
+    if isinstance(value, dict):
+        for key, entry in value.items():
+            yield from _flat(entry, f"{prefix}.{key}" if prefix else str(key))
+    else:
+        yield prefix, json.dumps(value)
