@@ -100,6 +100,7 @@ def env_settings(cfg: DictConfig) -> Any:
         n_envs=cfg.n_envs,
         vector=cfg.vector,
         fast_fetch=cfg.fast_fetch,
+        on_nan=cfg.on_nan,
         seed=cfg.seed,
         modules=[DESK_ENVS] if DESK_ENVS in sys.modules else [],
     )

@@ -14,6 +14,7 @@ from typing import Any
 
 from scilab_rl import __version__
 from scilab_rl.errors import ConfigError, ScilabRLError, SomeRunsFailedError, did_you_mean
+from scilab_rl.masking import MaskingFormatter, mask
 
 COMMANDS = {
     "play": "watch or film a trained policy and measure its success",
@@ -31,9 +32,16 @@ COMMANDS = {
     "algorithms": "list the algorithms",
     "envs": "list the environments",
     "explain": "show where the value of a key comes from",
+    "clean": "remove what killed processes have left behind",
     "doctor": "check the installation and say how to repair it",
 }
 EXIT_INTERRUPTED, EXIT_PIPE_CLOSED = 130, 141
+# Of Hydra, which would answer others with a page of usage.
+_HYDRA_FLAGS = (
+    "--help", "-h", "--hydra-help", "--cfg", "-c", "--resolve", "--package", "-p", "--run", "-r",
+    "--multirun", "-m", "--shell-completion", "-sc", "--config-path", "-cp", "--config-name",
+    "-cn", "--config-dir", "-cd", "--experimental-rerun", "--info", "-i",
+)  # fmt: skip
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -60,7 +68,7 @@ def run_command_line(arguments: list[str]) -> int:
     except ScilabRLError as error:
         if debug:
             traceback.print_exc()
-        sys.stderr.write(f"error: {' '.join(str(error).split())}\n")
+        sys.stderr.write(f"error: {mask(' '.join(str(error).split()))}\n")
         return error.exit_code
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
@@ -71,7 +79,7 @@ def run_command_line(arguments: list[str]) -> int:
     except Exception as error:
         if debug:
             raise
-        message = " ".join(str(error).split())
+        message = mask(" ".join(str(error).split()))
         sys.stderr.write(
             f"error: {type(error).__name__}: {message} (unexpected; --debug shows the traceback)\n"
         )
@@ -98,7 +106,20 @@ def _dispatch(arguments: list[str]) -> int:
             f"There is no command '{first}'.{did_you_mean(first, COMMANDS)} "
             f"Commands: {', '.join(COMMANDS)}. To train, give KEY=VALUE, for example env=FetchPush."
         )
-    return train(_with_host_as_key(arguments[1:] if first == "train" else arguments))
+    arguments = _with_host_as_key(arguments[1:] if first == "train" else arguments)
+    _refuse_unknown_flags(arguments)
+    return train(arguments)
+
+
+def _refuse_unknown_flags(arguments: Sequence[str]) -> None:
+    for argument in arguments:
+        flag = argument.partition("=")[0]
+        if flag.startswith("-") and flag not in _HYDRA_FLAGS:
+            words = [*_HYDRA_FLAGS, *config_keys()]
+            raise ConfigError(
+                f"There is no flag '{flag}'.{did_you_mean(flag.lstrip('-'), words)} Keys are given "
+                "without dashes, as in n_epochs=3; `scilab-rl --help` lists keys and flags."
+            )
 
 
 def _with_host_as_key(arguments: list[str]) -> list[str]:
@@ -178,7 +199,7 @@ def _set_up_messages(debug: bool) -> None:
     logger = logging.getLogger("scilab_rl")
     logger.handlers.clear()
     handler = logging.StreamHandler(sys.stderr)
-    handler.setFormatter(logging.Formatter("%(message)s"))
+    handler.setFormatter(MaskingFormatter("%(message)s"))
     logger.addHandler(handler)
     logger.setLevel(logging.DEBUG if debug else logging.INFO)
     logger.propagate = False

@@ -46,6 +46,7 @@ class Key:
         kind: What its value is.
         meaning: One sentence for ``--help`` and the reference.
         low: Smallest allowed number.
+        high: Largest allowed number.
         choices: Allowed words.
         optional: Whether null is allowed.
     """
@@ -54,6 +55,7 @@ class Key:
     kind: str
     meaning: str
     low: float = -math.inf
+    high: float = math.inf
     choices: tuple[Any, ...] = ()
     optional: bool = False
 
@@ -66,13 +68,20 @@ KEYS = (
         "keyword arguments of the environment (+env_kwargs.reward_type=dense)",
     ),
     Key("wrappers", LIST, "wrappers around the environment, each with a _target_"),
-    Key("n_envs", WHOLE, "training environments side by side", low=1),
+    Key("n_envs", WHOLE, "training environments side by side", low=1, high=4096),
     Key("vector", TEXT, "where they run", choices=("inprocess", "subprocess")),
     Key("fast_fetch", SWITCH, "make Fetch's steps faster; its observations stay the same"),
     Key(
+        "on_nan",
+        TEXT,
+        "what an observation or reward that is no number does",
+        choices=("stop", "end_episode", "ignore"),
+    ),
+    Key("warn_after_seconds", NUMBER, "time without a step until a warning; 0: never", low=0),
+    Key(
         "tuned", SWITCH, "use the tuned values for this algorithm and environment, if there are any"
     ),
-    Key("seed", WHOLE, "seed of everything; 0 draws one and records it", low=0),
+    Key("seed", WHOLE, "seed of everything; 0 draws one and records it", low=0, high=2**32 - 1),
     Key("eval_after_n_steps", WHOLE, "environment steps per epoch", low=1),
     Key("n_epochs", WHOLE, "most epochs", low=1),
     Key("n_test_rollouts", WHOLE, "evaluation episodes after each epoch", low=1),
@@ -114,7 +123,13 @@ KEYS = (
     Key("group", TEXT, "group of runs, for trackers", optional=True),
     Key("tags", LIST, "tags of the run, for trackers", optional=True),
     Key("device", TEXT, "auto, cpu, cuda, cuda:0, mps"),
-    Key("n_threads", WHOLE, "CPU threads of PyTorch; 1 is fastest for small networks", low=1),
+    Key(
+        "n_threads",
+        WHOLE,
+        "CPU threads of PyTorch; 1 is fastest for small networks",
+        low=1,
+        high=4096,
+    ),
 )
 GROUPS = ("algorithm", "tracking")
 # What the runs of a performance test have to reach; a single run does not look at it.
@@ -362,6 +377,10 @@ def _check_value(key: Key, value: Any) -> None:
         raise ConfigError(f"{key.name} must be a {key.kind}, but it is {value!r}.")
     if key.kind in (NUMBER, WHOLE) and value < key.low:
         raise ConfigError(f"{key.name} must be at least {key.low:g}, but it is {value}.")
+    if key.kind in (NUMBER, WHOLE) and value > key.high:
+        raise ConfigError(f"{key.name} must be at most {key.high}, but it is {value}.")
+    if value == "" and key.name != "info":
+        raise ConfigError(f"{key.name} must be a {key.kind}, but it is empty.")
 
 
 def _is_number(value: Any) -> bool:

@@ -24,7 +24,14 @@ from scilab_rl.assembly import (
     prepare_torch,
     restore_policy,
 )
-from scilab_rl.errors import ConfigError, ScilabRLError, did_you_mean
+from scilab_rl.errors import (
+    ConfigError,
+    EnvironmentError_,
+    NumericalError,
+    ScilabRLError,
+    did_you_mean,
+)
+from scilab_rl.masking import MaskingFormatter, mask
 from scilab_rl.metrics.criteria import final_score
 from scilab_rl.results import CONFIG_FILE, RunDirectory, RunResult
 from scilab_rl.seeding import derive_seed
@@ -59,11 +66,17 @@ def run(
     with directory.in_use(), _log_file(directory / "train.log"):
         try:
             session = build(cfg, directory)
+            provenance.write(directory, overrides, session.eval_env.envs[0])
+            session.begin()
         except ConfigError:
             directory.discard()
             raise
-        session.begin()
-        provenance.write(directory, overrides, session.eval_env.envs[0])
+        except OSError as error:
+            directory.discard()
+            raise ConfigError(
+                f"'{directory}' cannot be written: {error.strerror}. Choose another place with "
+                "base_logdir=DIR."
+            ) from error
         if watch is not None:
             watch(session)
         return session.learn()
@@ -140,7 +153,7 @@ class Session:
         """Let the run be seen: its status, its final configuration, and the link to the newest."""
         directory = self.directory
         directory.write_result(RunResult("running", None, 0, 0, 0.0, str(directory)))
-        files.write_text(directory / CONFIG_FILE, OmegaConf.to_yaml(self.cfg, resolve=True))
+        files.write_text(directory / CONFIG_FILE, mask(OmegaConf.to_yaml(self.cfg, resolve=True)))
         directory.publish_as_last(Path(self.cfg.base_logdir))
 
     def learn(self, resumed_step: int | None = None) -> RunResult:
@@ -155,21 +168,46 @@ class Session:
         try:
             self._learn_until_stopped(outcome, resumed_step or 0)
         except Exception as error:
-            outcome["error"] = str(error) or type(error).__name__
-            files.write_text(self.directory / "error.log", traceback.format_exc())
-            if isinstance(error, ScilabRLError):
+            self._keep_what_can_be_kept(error)
+            explained = self._explained(error)
+            outcome["error"] = mask(str(explained))
+            if explained is error:
                 raise
-            raise ScilabRLError(
-                f"{type(error).__name__}: {error} (details in {self.directory / 'error.log'})"
-            ) from error
+            raise explained from error
         finally:
             result = self._result(time.monotonic() - started, **outcome)
-            self.directory.write_result(result)
-            self.showing.close()
-            self.trackers.end(result)
-            self.train_env.close()
-            self.eval_env.close()
+            self._close(result)
         return result
+
+    def _keep_what_can_be_kept(self, error: Exception) -> None:
+        """Write the traceback and, when only an environment has failed, a checkpoint."""
+        with contextlib.suppress(OSError):  # the disk may be what is wrong
+            files.write_text(self.directory / "error.log", mask(traceback.format_exc()))
+        if isinstance(error, EnvironmentError_):
+            self.trainer.save_after_failure()
+
+    def _explained(self, error: Exception) -> ScilabRLError:
+        if isinstance(error, ScilabRLError):
+            return error
+        try:  # libraries fail in many words on weights that are no numbers
+            self.trainer.refuse_nan({})
+        except NumericalError as cause:
+            return cause
+        return ScilabRLError(
+            f"{type(error).__name__}: {error} (details in {self.directory / 'error.log'})"
+        )
+
+    def _close(self, result: RunResult) -> None:
+        """Write the result and close everything, whatever goes wrong meanwhile."""
+        with contextlib.ExitStack() as closing:
+            closing.callback(self.eval_env.close)
+            closing.callback(self.train_env.close)
+            closing.callback(self.trackers.end, result)
+            closing.callback(self.showing.close)
+            try:
+                self.directory.write_result(result)
+            except OSError as error:
+                _log.warning("The result of the run cannot be written: %s.", error.strerror)
 
     def _learn_until_stopped(self, outcome: dict[str, Any], steps_done: int) -> None:
         from scilab_rl.training.interruption import TrainingInterrupted, polite_stop
@@ -177,7 +215,7 @@ class Session:
 
         trainer = self.trainer
         self.showing.begin()
-        with polite_stop() as trainer.stop_request:
+        with polite_stop() as trainer.stop_request, self._watchdog():
             try:
                 self.algorithm.learn(
                     trainer.total_steps - steps_done,
@@ -190,6 +228,17 @@ class Session:
                 outcome["status"] = "interrupted"
                 outcome["signal_number"] = interruption.signal_number
         trainer.save_policy(FINISHED)
+
+    def _watchdog(self) -> contextlib.AbstractContextManager[None]:
+        from scilab_rl.envs.vectorize import observed_layer
+        from scilab_rl.training.watchdog import watchdog
+
+        layers = [observed_layer(env) for env in (self.train_env, self.eval_env)]
+        return watchdog(
+            lambda: [layer.step_count for layer in layers],
+            self.cfg.warn_after_seconds,
+            self.directory / "stack.txt",
+        )
 
     def _result(self, seconds: float, **outcome: Any) -> RunResult:
         trainer = self.trainer
@@ -267,7 +316,10 @@ def run_info(
         seed=cfg.seed,
         total_steps=trainer.total_steps,
         n_epochs=cfg.n_epochs,
-        parameters=config.flat(cfg),
+        parameters={
+            name: mask(value) if isinstance(value, str) else value
+            for name, value in config.flat(cfg).items()
+        },
         project=cfg.project_name,
         entity=cfg.entity,
         group=cfg.group,
@@ -301,11 +353,16 @@ def score(store: Any, cfg: DictConfig) -> float | None:
     return value
 
 
+class _LogFile(logging.FileHandler):
+    def handleError(self, record: logging.LogRecord) -> None:
+        """Say nothing: a full disk is told by those who write metrics and checkpoints."""
+
+
 @contextlib.contextmanager
 def _log_file(path: Path) -> Iterator[None]:
     """Write the package's log messages to a file too."""
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    handler = _LogFile(path, encoding="utf-8")
+    handler.setFormatter(MaskingFormatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
     logger = logging.getLogger("scilab_rl")
     logger.addHandler(handler)
     try:

@@ -2,12 +2,56 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
 import os
+import shutil
+import signal
+from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
+
+# Tests set it to let a process end, or a disk fill up, at a place of their choice.
+FAULT_VARIABLE = "SCILAB_FAULT"
+_TEMPORARY = ".*.tmp"
+_passed: Counter[str] = Counter()
+
+
+def crash_point(name: str) -> None:
+    """Do what ``SCILAB_FAULT`` asks for at this place; without it, nothing.
+
+    ``checkpoint.after_tensors:3:SIGKILL`` ends the process when it passes here for the third time,
+    ``metrics.before_line:1:ENOSPC`` lets the first line find the disk full.
+
+    Args:
+        name: Of the place.
+
+    Raises:
+        OSError: If an error is asked for.
+    """
+    wanted, _, rest = os.environ.get(FAULT_VARIABLE, "").partition(":")
+    if wanted != name:
+        return
+    _passed[name] += 1
+    count, _, action = rest.partition(":")
+    if _passed[name] != int(count):
+        return
+    if action.startswith("SIG"):
+        os.kill(os.getpid(), signal.Signals[action])
+    else:
+        number = getattr(errno, action)
+        raise OSError(number, os.strerror(number))
+
+
+def remove_unfinished(directory: Path) -> None:
+    """Remove what a killed process was writing in this directory; nobody else may write there."""
+    for abandoned in directory.glob(_TEMPORARY):
+        if abandoned.is_dir() and not abandoned.is_symlink():
+            shutil.rmtree(abandoned, ignore_errors=True)
+        else:
+            abandoned.unlink(missing_ok=True)
 
 
 def atomic_write(path: Path, write: Callable[[IO[bytes]], object]) -> None:
@@ -23,6 +67,7 @@ def atomic_write(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             write(file)
             file.flush()
             os.fsync(file.fileno())
+        crash_point("file.before_replace")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)

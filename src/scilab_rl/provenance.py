@@ -14,6 +14,7 @@ from typing import Any
 import yaml
 
 from scilab_rl import files
+from scilab_rl.masking import mask
 from scilab_rl.results import CONFIG_FILE, RunDirectory
 
 PROVENANCE_FILE = "provenance.json"
@@ -37,19 +38,17 @@ def write(directory: RunDirectory, overrides: Sequence[str], env: Any) -> None:
         overrides: What the user typed.
         env: A single environment, for the fingerprint; it is reset and stepped.
     """
-    from scilab_rl.envs.fingerprint import fingerprint
-
     diff = _git("diff", "HEAD")
     if diff:
         files.write_text(directory / "git.diff", diff[:_DIFF_LIMIT_BYTES])
     files.write_json(
         directory / PROVENANCE_FILE,
         {
-            "command": shlex.join(sys.argv),
-            "overrides": list(overrides),
+            "command": mask(shlex.join(sys.argv)),
+            "overrides": [mask(override) for override in overrides],
             "git_commit": _git("rev-parse", "HEAD").strip() or None,
             "git_changed": bool(diff),
-            "fingerprint": fingerprint(env),
+            "fingerprint": _fingerprint(env),
             "python": platform.python_version(),
             "platform": platform.platform(),
             "versions": {d.name: d.version for d in sorted(metadata.distributions(), key=_name)},
@@ -109,6 +108,16 @@ def _difference(env_id: str, sources: Mapping[str, Sequence[Mapping[str, Any]]])
         f"{env_id} did not behave the same in these runs, so their results do not compare: its "
         f"fingerprints (runs) are {counts}.{because}"
     )
+
+
+def _fingerprint(env: Any) -> str | None:
+    """Return the fingerprint; None for an environment that fails, which training will tell."""
+    from scilab_rl.envs.fingerprint import fingerprint
+
+    try:
+        return fingerprint(env)
+    except Exception:  # noqa: BLE001 - any environment may fail in its own way
+        return None
 
 
 def _name(distribution: metadata.Distribution) -> str:

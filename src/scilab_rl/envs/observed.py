@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import signal
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -9,11 +11,13 @@ from typing import Any, Protocol
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 
+from scilab_rl.envs.contract import FAILURE_KEY, BrokenContractError
 from scilab_rl.envs.frames import FRAME_KEY, STATE_KEY
 from scilab_rl.errors import EnvironmentError_, NumericalError, ScilabRLError
 from scilab_rl.metrics.success import success_of as success_of
 
 Observation = np.ndarray | dict[str, np.ndarray]
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,8 @@ class ObservedVecEnv(VecEnvWrapper):
         venv: The vector environment.
         phase: ``train`` or ``eval``.
         name: How error messages call the environment.
+        seed: Seed of the run, for error messages.
+        allows_nan: Whether observations and rewards may be no numbers.
 
     Attributes:
         observers: Called in order at each step.
@@ -75,10 +81,20 @@ class ObservedVecEnv(VecEnvWrapper):
         reset_state: The simulator's state in that scene.
     """
 
-    def __init__(self, venv: VecEnv, phase: str, name: str) -> None:
+    def __init__(
+        self,
+        venv: VecEnv,
+        phase: str,
+        name: str,
+        *,
+        seed: int | None = None,
+        allows_nan: bool = False,
+    ) -> None:
         super().__init__(venv)
         self.phase = phase
         self.name = name
+        self.allows_nan = allows_nan
+        self._run_seed = seed
         self.observers: list[StepObserver] = []
         self.step_count = 0
         self.episodes = np.zeros(self.num_envs, dtype=np.int64)
@@ -92,6 +108,7 @@ class ObservedVecEnv(VecEnvWrapper):
         """Reset all environments; the running episodes are dropped."""
         with self._errors_named("reset"):
             self._observations = self.venv.reset()
+        self._raise_reported("reset", self.venv.reset_infos)
         self._check_finite(self._observations, "observation")
         self.episode_steps[:] = 0
         self._take_first_scene()
@@ -116,6 +133,9 @@ class ObservedVecEnv(VecEnvWrapper):
         """Finish the step, check it and show it to the observers."""
         with self._errors_named("step"):
             observations, rewards, dones, infos = self.venv.step_wait()
+        self._raise_reported("step", infos)
+        if dones.any():
+            self._raise_reported("reset", self.venv.reset_infos)
         observed: Any = observations
         self._check_finite(observed, "observation")
         for index in np.flatnonzero(dones):
@@ -145,6 +165,17 @@ class ObservedVecEnv(VecEnvWrapper):
         self._observations = observed
         return observations, rewards, dones, infos
 
+    def close(self) -> None:
+        """Close all environments; what goes wrong meanwhile is told and stops nobody."""
+        try:
+            self.venv.close()
+        except Exception as error:  # noqa: BLE001 - the run is over, and its result counts
+            if not isinstance(error, (EOFError, OSError)):  # of a worker that has gone before
+                _log.warning("%s", self._failure("close", type(error).__name__, str(error)))
+            for process in getattr(self.venv, "processes", ()):
+                process.kill()
+                process.join()
+
     def _take_first_scene(self) -> None:
         info = self.venv.reset_infos[0]
         self.reset_frame, self.reset_state = info.pop(FRAME_KEY, None), info.pop(STATE_KEY, None)
@@ -166,6 +197,8 @@ class ObservedVecEnv(VecEnvWrapper):
         self._observations = state["observations"]
 
     def _check_finite(self, values: Any, what: str) -> None:
+        if self.allows_nan:
+            return
         entries = values.items() if isinstance(values, dict) else [("", values)]
         for key, array in entries:
             if np.issubdtype(array.dtype, np.floating) and not np.isfinite(array).all():
@@ -176,6 +209,30 @@ class ObservedVecEnv(VecEnvWrapper):
                     f"{index[1:]} of environment {index[0]} after step {self.step_count}; "
                     f"last action {last}."
                 )
+
+    def _raise_reported(self, call: str, infos: Sequence[dict[str, Any]]) -> None:
+        """Raise what happened in another process."""
+        for info in infos:
+            if FAILURE_KEY in info:
+                raise self._failure(call, *info[FAILURE_KEY])
+
+    def _failure(self, call: str, kind: str, text: str) -> EnvironmentError_:
+        what = "broke its contract" if kind == BrokenContractError.__name__ else f"raised {kind}"
+        seed = "" if self._run_seed is None else f" (seed {self._run_seed})"
+        return EnvironmentError_(
+            f"{self.name} {what} in {call}() at {self.phase} step {self.step_count}{seed}: "
+            f"{' '.join(text.split())}"
+        )
+
+    def _dead_worker(self) -> str:
+        """Say which worker process has ended and how, if one has."""
+        for index, process in enumerate(getattr(self.venv, "processes", ())):
+            process.join(0.2)
+            code = process.exitcode
+            if code is not None:
+                hint = ", maybe out of memory" if code == -signal.SIGKILL else ""
+                return f"its worker process {index} ended with exit code {code}{hint}"
+        return "a worker process does not answer"
 
     def _errors_named(self, call: str) -> _NamedErrors:
         return _NamedErrors(self, call)
@@ -191,11 +248,12 @@ class _NamedErrors:
         pass
 
     def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
+        is_pipe_broken = isinstance(error, (EOFError, ConnectionError))
+        if is_pipe_broken and hasattr(self.env.venv, "processes"):
+            text = self.env._dead_worker()
+            raise self.env._failure(self.call, type(error).__name__, text) from error
         if isinstance(error, Exception) and not isinstance(error, ScilabRLError):
-            raise EnvironmentError_(
-                f"{self.env.name} raised {type(error).__name__} in {self.call}() at "
-                f"{self.env.phase} step {self.env.step_count}: {error}"
-            ) from error
+            raise self.env._failure(self.call, type(error).__name__, str(error)) from error
 
 
 def _batch_of_one(observation: Any) -> Any:

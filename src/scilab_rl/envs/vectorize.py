@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import os
+import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,7 @@ from stable_baselines3.common.vec_env import (
     VecNormalize,
 )
 
+from scilab_rl.envs.contract import IGNORE, STOP, ContractGuard
 from scilab_rl.envs.frames import FrameCapture
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.registration import resolve_env_id
@@ -47,6 +49,7 @@ class EnvSettings:
         modules: Imported first, because they register environments.
         render_mode: ``rgb_array`` or ``human`` when frames are wanted.
         fast_fetch: Whether Fetch goes without its look-ups by name; the observations are the same.
+        on_nan: ``stop``, ``end_episode`` or ``ignore``, see `contract.ContractGuard`.
     """
 
     env_id: str
@@ -58,6 +61,7 @@ class EnvSettings:
     modules: Sequence[str] = ()
     render_mode: str | None = None
     fast_fetch: bool = True
+    on_nan: str = STOP
 
 
 def make_train_env(settings: EnvSettings) -> VecEnv:
@@ -77,7 +81,7 @@ def make_eval_env(settings: EnvSettings) -> VecEnv:
     return env
 
 
-def make_single_env(settings: EnvSettings) -> gym.Env:
+def make_single_env(settings: EnvSettings, *, in_worker: bool = False) -> gym.Env:
     """Make one environment with its per-environment wrappers; also called in worker processes."""
     for module in settings.modules:
         importlib.import_module(module)
@@ -104,7 +108,13 @@ def make_single_env(settings: EnvSettings) -> gym.Env:
         raise EnvironmentError_(
             f"{settings.env_id} cannot be made: {type(error).__name__}: {error}"
         ) from error
-    return ReplayableEpisode(env)
+    return ReplayableEpisode(ContractGuard(env, settings.on_nan, in_worker=in_worker))
+
+
+def _make_in_worker(settings: EnvSettings) -> gym.Env:
+    # Ctrl-C on the terminal reaches all processes; the main one says when it is time to end.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    return make_single_env(settings, in_worker=True)
 
 
 def observed_layer(env: VecEnv) -> ObservedVecEnv:
@@ -116,13 +126,17 @@ def observed_layer(env: VecEnv) -> ObservedVecEnv:
 
 
 def _make(settings: EnvSettings, phase: str) -> VecEnv:
-    makers: list[Callable[[], gym.Env]] = [partial(make_single_env, settings)] * settings.n_envs
     env: VecEnv
     if settings.vector == "subprocess" and settings.n_envs > 1:
-        env = SubprocVecEnv(makers, start_method=os.environ.get("SCILAB_RL_START_METHOD"))
+        env = SubprocVecEnv(
+            [partial(_make_in_worker, settings)] * settings.n_envs,
+            start_method=os.environ.get("SCILAB_RL_START_METHOD"),
+        )
     else:
-        env = DummyVecEnv(makers)
-    env = ObservedVecEnv(env, phase, settings.env_id)
+        env = DummyVecEnv([partial(make_single_env, settings)] * settings.n_envs)
+    env = ObservedVecEnv(
+        env, phase, settings.env_id, seed=settings.seed, allows_nan=settings.on_nan == IGNORE
+    )
     for wrapper in settings.wrappers:
         if _wraps_vectors(wrapper):
             env = wrapper(env)

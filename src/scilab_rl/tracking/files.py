@@ -49,11 +49,13 @@ class FilesTracker(Tracker):
         self._rows.append(row)
         with self._errors_named(CSV):
             self._append_csv(row)
+            files.crash_point("metrics.after_row")
 
     def end(self, result: RunResult) -> None:
         """Close the files."""
         if self._jsonl is not None:
-            self._jsonl.close()
+            with contextlib.suppress(OSError):  # a full disk has been told when it was met
+                self._jsonl.close()
 
     def _go_back_to(self, step: int) -> None:
         """Drop what was written after a checkpoint: it will be measured again."""
@@ -74,7 +76,9 @@ class FilesTracker(Tracker):
     def _write_line(self, line: Mapping[str, Any]) -> None:
         assert self._jsonl is not None
         with self._errors_named(JSONL):
+            files.crash_point("metrics.before_line")
             self._jsonl.write(json.dumps(line) + "\n")
+            files.crash_point("metrics.after_line")
 
     def _append_csv(self, row: Mapping[str, float]) -> None:
         path = self._run_dir / CSV

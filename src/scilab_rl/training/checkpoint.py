@@ -41,13 +41,15 @@ def save(
         step: Environment steps so far, for the manifest.
         about: More facts for the manifest.
     """
-    for abandoned in directory.parent.glob(".*.tmp/"):  # of a process that was killed
-        shutil.rmtree(abandoned, ignore_errors=True)
+    files.remove_unfinished(directory.parent)
+    files.crash_point("checkpoint.begin")
     unfinished = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
     (unfinished / _ARRAYS).mkdir(parents=True)
     try:
         _write_content(snapshot, unfinished)
+        files.crash_point("checkpoint.before_manifest")
         _write_manifest(unfinished, step, about or {})
+        files.crash_point("checkpoint.before_swap")
         _swap(unfinished, directory)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -125,7 +127,11 @@ def _write_content(snapshot: Snapshot, directory: Path) -> None:
         name: tensor.detach().cpu().contiguous().clone()
         for name, tensor in snapshot.tensors.items()
     }
-    save_file(tensors, directory / _TENSORS)
+    try:
+        save_file(tensors, directory / _TENSORS)
+    except SafetensorError as error:  # its word for a full disk
+        raise OSError(str(error)) from error
+    files.crash_point("checkpoint.after_tensors")
     with (directory / _TENSORS).open("rb") as file:
         os.fsync(file.fileno())
     names = {}
@@ -133,6 +139,7 @@ def _write_content(snapshot: Snapshot, directory: Path) -> None:
         names[name] = f"{index}.npy"
         with (directory / _ARRAYS / names[name]).open("wb") as file:
             np.save(file, array, allow_pickle=False)
+            files.crash_point("checkpoint.in_arrays")
             file.flush()
             os.fsync(file.fileno())
     files.write_json(directory / _STATE, {"arrays": names, "tree": snapshot.tree})
@@ -146,7 +153,7 @@ def _write_manifest(directory: Path, step: int, about: dict[str, Any]) -> None:
             "schema_version": SCHEMA_VERSION,
             "step": step,
             **about,
-            "versions": {"python": platform.python_version()} | _versions(),
+            "versions": versions(),
             "files": {
                 str(path.relative_to(directory)): {
                     "bytes": path.stat().st_size,
@@ -158,8 +165,9 @@ def _write_manifest(directory: Path, step: int, about: dict[str, Any]) -> None:
     )
 
 
-def _versions() -> dict[str, str]:
-    installed = {}
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on."""
+    installed = {"python": platform.python_version()}
     for package in _VERSIONED:
         try:
             installed[package] = metadata.version(package)
@@ -177,6 +185,7 @@ def _swap(finished: Path, directory: Path) -> None:
     if directory.exists():
         shutil.rmtree(previous, ignore_errors=True)
         directory.rename(previous)
+    files.crash_point("checkpoint.in_swap")
     finished.rename(directory)
     files.fsync_directory(directory.parent)
     shutil.rmtree(previous, ignore_errors=True)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 import logging
 import shutil
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.vectorize import observed_layer
 from scilab_rl.errors import CheckpointError
-from scilab_rl.files import point_to
+from scilab_rl.files import crash_point, point_to, remove_unfinished
 from scilab_rl.training import checkpoint
 from scilab_rl.training.snapshot import Snapshot, capture, random_state, restore, set_random_state
 
@@ -27,18 +28,20 @@ GENERATIONS = 2
 _log = logging.getLogger(__name__)
 
 
-def training_state(model: Any, trainer: Any) -> dict[str, Any]:
+def training_state(model: Any, trainer: Any, *, with_episodes: bool = True) -> dict[str, Any]:
     """Return everything that the rest of the run depends on, name to object.
 
     Args:
         model: The algorithm.
         trainer: The `Trainer` that watches it.
+        with_episodes: Whether the running episodes belong to it; otherwise a resumed run begins
+            new ones.
     """
     env = observed_layer(model.get_env())
     return {
         "algorithm": model,
         "normalization": _normalization_layers(model.get_env()),
-        "environments": env.env_method("episode_state"),
+        "environments": env.env_method("episode_state") if with_episodes else [],
         "observed": env.state(),
         "statistics": trainer.statistics,
         "recorded": trainer.metric_logger.state(),
@@ -48,9 +51,9 @@ def training_state(model: Any, trainer: Any) -> dict[str, Any]:
     }
 
 
-def take(model: Any, trainer: Any) -> Snapshot:
+def take(model: Any, trainer: Any, *, with_episodes: bool = True) -> Snapshot:
     """Capture the state; tensors and arrays are views that later steps change."""
-    return capture(training_state(model, trainer))
+    return capture(training_state(model, trainer, with_episodes=with_episodes))
 
 
 def frozen(snapshot: Snapshot) -> Snapshot:
@@ -68,7 +71,7 @@ def continue_from(snapshot: Snapshot, model: Any, trainer: Any) -> None:
     Raises:
         CheckpointError: If the snapshot is of another algorithm or environment.
     """
-    state = training_state(model, trainer)
+    state = training_state(model, trainer, with_episodes=False)
     # What has no counterpart in a fresh run is rebuilt from the description alone.
     for name in ("environments", "observed", "recorded", "random", "best"):
         state[name] = None
@@ -92,7 +95,9 @@ def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
     folder.mkdir(exist_ok=True)
     directory = folder / f"step_{step:010d}"
     checkpoint.save(snapshot, directory, step=step)
+    crash_point("checkpoint.before_link")
     point_to(folder / LAST, directory)
+    crash_point("checkpoint.before_forgetting")
     for old in _generations(run_dir)[GENERATIONS:]:
         shutil.rmtree(old, ignore_errors=True)
     return directory
@@ -101,24 +106,45 @@ def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
 def load_latest(run_dir: Path) -> tuple[Snapshot, int]:
     """Load the newest checkpoint that is whole, and its step.
 
+    What a killed process left unfinished is removed.
+
     Raises:
         CheckpointError: If there is none.
     """
+    for folder in (run_dir, run_dir / FOLDER):
+        remove_unfinished(folder)
     damaged = []
     for directory in _generations(run_dir):
         try:
-            snapshot, step = checkpoint.load(directory), checkpoint.verify(directory)["step"]
+            snapshot, manifest = checkpoint.load(directory), checkpoint.verify(directory)
         except CheckpointError as error:
             damaged.append(str(error))
             continue
         if damaged:
             _log.warning("%s Using the older %s.", " ".join(damaged), directory.name)
-        return snapshot, step
+        _tell_other_versions(manifest)
+        return snapshot, manifest["step"]
     raise CheckpointError(
         " ".join(damaged)
         or f"'{run_dir}' has no checkpoint. Runs keep one with save_model_freq=N, and when "
         "they are stopped with Ctrl-C."
     )
+
+
+def _tell_other_versions(manifest: Mapping[str, Any]) -> None:
+    """Say when a package is not the one that wrote the checkpoint: numbers may differ then."""
+    saved, here = manifest.get("versions", {}), checkpoint.versions()
+    changed = [
+        f"{name} {saved[name]} -> {here[name]}"
+        for name in here
+        if name in saved and saved[name] != here[name]
+    ]
+    if changed:
+        _log.warning(
+            "The checkpoint was written with other versions (%s), so the rest of the run is not "
+            "bit for bit what it would have been.",
+            ", ".join(changed),
+        )
 
 
 def _generations(run_dir: Path) -> list[Path]:
@@ -143,6 +169,8 @@ def _retell_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[st
         for index, episode in enumerate(episodes)
     ]
     expected = observed["observations"]
+    if not episodes:  # one of them had failed when the checkpoint was made
+        return False
     for index, observation in enumerate(repeated):
         if not _equal(observation, _entry(expected, index)):
             _log.warning(

@@ -162,7 +162,7 @@ class Trainer(BaseCallback):
         training_seconds = time.monotonic() - self._epoch_started
         values = self._training_metrics(training_seconds)
         values |= self._evaluate()
-        self._refuse_nan(values)
+        self.refuse_nan(values)
         # What is not defined in an epoch (the explained variance of equal returns) is a gap.
         values = {name: value for name, value in values.items() if math.isfinite(value)}
         self.store.append(self.num_timesteps, values)
@@ -202,14 +202,21 @@ class Trainer(BaseCallback):
         evaluation = evaluate(self.model, self.eval_env, self.plan.n_test_rollouts, seed)
         return evaluation.metrics() | {"time/eval_seconds": time.monotonic() - started}
 
-    def _refuse_nan(self, values: Mapping[str, float]) -> None:
-        """Stop a run whose losses or weights are no numbers: all that follows would be noise."""
+    def refuse_nan(self, values: Mapping[str, float]) -> None:
+        """Stop a run whose losses or weights are no numbers: all that follows would be noise.
+
+        Args:
+            values: Metrics to look at, besides the weights.
+
+        Raises:
+            NumericalError: With the first that is none.
+        """
         broken = {
             name: value
             for name, value in values.items()
             if ("loss" in name or name.startswith("eval/")) and not math.isfinite(value)
         }
-        policy = getattr(self.model, "policy", None)
+        policy = getattr(getattr(self, "model", None), "policy", None)
         if isinstance(policy, torch.nn.Module):
             broken |= {
                 f"weight {name}": math.nan
@@ -243,6 +250,25 @@ class Trainer(BaseCallback):
         if self._save_checkpoint(step, snapshot):
             _log.info("Stopped at step %d. Resume with: scilab-rl resume %s", step, self.run_dir)
         raise TrainingInterrupted(self.stop_request.signal_number)
+
+    def save_after_failure(self) -> None:
+        """Keep what was learned until an environment failed; resumed, new episodes begin."""
+        model = getattr(self, "model", None)
+        if model is None or not model.num_timesteps:
+            return
+        if self._boundary is not None:
+            step, snapshot = self._boundary
+        elif self._rollouts_are_long():
+            return
+        else:
+            step = model.num_timesteps
+            snapshot = resume.take(model, self, with_episodes=False)
+        if step and self._save_checkpoint(step, snapshot):
+            _log.info(
+                "What was learned until step %d is kept. Go on with: scilab-rl resume %s",
+                step,
+                self.run_dir,
+            )
 
     def save_policy(self, name: str) -> None:
         """Save everything but the replay buffer under this name in the run directory."""
