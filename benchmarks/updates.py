@@ -20,6 +20,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -36,6 +37,8 @@ from scilab_rl.envs.vectorize import make_train_env
 from scilab_rl.workspace import open_desk
 
 PEER = "stable-baselines3"
+SBX = "sbx"
+PEERS_PYTHON = Path(__file__).parents[1] / ".venv-peers" / "bin" / "python"
 
 
 class Entry(NamedTuple):
@@ -51,6 +54,11 @@ ENTRIES = (
     Entry(f"{PEER}, our buffer", ("algorithm=sac",)),
     Entry("cleansac", ("algorithm=cleansac",)),
     Entry("cleansac bfloat16", ("algorithm=cleansac", "algorithm.precision=bfloat16")),
+    Entry(SBX, ()),
+    Entry("jaxsac", ("algorithm=jaxsac",)),
+    Entry("jaxsac, 8 in a round", ("algorithm=jaxsac",), 8),
+    Entry("jaxsac bfloat16, 8 in a round", ("algorithm=jaxsac", "algorithm.precision=bfloat16"), 8),
+    Entry("jaxtd3, 8 in a round", ("algorithm=jaxtd3",), 8),
 )
 # Batch size and hidden layers.
 SIZES = ((256, (256, 256)), (2048, (512, 512, 512)))
@@ -70,6 +78,9 @@ def main() -> None:
     arguments = parser.parse_args()
     open_desk()
     entries = [entry for entry in ENTRIES if not arguments.only or entry.name in arguments.only]
+    if not PEERS_PYTHON.exists():
+        sys.stdout.write("Without sbx: `make .venv-peers/.installed` installs the peers.\n")
+        entries = [entry for entry in entries if entry.name != SBX]
     report: dict[str, Any] = {"threads": arguments.threads}
     for batch_size, net_arch in SIZES:
         rounds = max(3, arguments.rounds * 256 // batch_size)
@@ -96,8 +107,9 @@ def measure(
     for _ in range(rounds):
         for name in (*updates, *reversed(updates)):
             started = time.perf_counter(), time.process_time()
-            updates[name]()
-            times[name].append((time.perf_counter() - started[0], time.process_time() - started[1]))
+            elsewhere = updates[name]() or 0.0
+            wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]
+            times[name].append((wall, cpu + elsewhere))
     results: Results = {}
     for entry in entries:
         wall, cpu = 1e3 * np.array(times[entry.name]).T / entry.updates_per_call
@@ -116,6 +128,8 @@ def prepare(
     entry: Entry, batch_size: int, net_arch: tuple[int, ...], threads: int
 ) -> Callable[[], Any]:
     """Build an algorithm with data, and return what does its updates."""
+    if entry.name == SBX:
+        return peer_process("sbx_sac.py", batch_size, net_arch)
     layers = f"[{','.join(map(str, net_arch))}]"
     is_peer = entry.overrides[0] == "algorithm=sac"
     architecture = f"algorithm.policy_kwargs={{net_arch:{layers}}}" if is_peer else ""
@@ -139,7 +153,36 @@ def prepare(
 
         algorithm.set_logger(MetricLogger())
         return lambda: algorithm.train(entry.updates_per_call, batch_size)
-    return lambda: algorithm.train(entry.updates_per_call)
+    if not hasattr(algorithm, "rounds"):
+        return lambda: algorithm.train(entry.updates_per_call)
+    algorithm.gradient_steps = entry.updates_per_call
+
+    def update_round() -> None:
+        algorithm.rounds.start(algorithm.draw())
+        algorithm.finish_round()
+
+    return update_round
+
+
+def peer_process(script: str, batch_size: int, net_arch: tuple[int, ...]) -> Callable[[], float]:
+    """Start a peer in its own virtual environment, and return what makes it do one update.
+
+    The function returns the seconds of processor time that the peer took.
+    """
+    command = [PEERS_PYTHON, Path(__file__).parent / "peers" / script, batch_size, *net_arch]
+    process = subprocess.Popen(
+        list(map(str, command)), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert process.stdin is not None and process.stdout is not None
+    requests, answers = process.stdin, process.stdout
+    answers.readline()  # it is ready
+
+    def update() -> float:
+        requests.write("update\n")
+        requests.flush()
+        return float(answers.readline())
+
+    return update
 
 
 def recorded_steps(env: Any) -> Iterator[tuple[Any, ...]]:
