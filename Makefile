@@ -7,7 +7,7 @@ EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim
 WORKERS ?= 2
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check format test test-slow test-myosuite demo figure-fetchpush mlflow clean-venv
+.PHONY: help setup check format test test-slow smoke performance test-myosuite demo figure-fetchpush mlflow clean-venv
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -41,6 +41,12 @@ test: $(VENV)/.installed  ## the fast tests
 
 test-slow: $(VENV)/.installed  ## the slow and the performance tests (an hour)
 	$(BIN)/python -m pytest -m "slow or performance"
+
+smoke: $(VENV)/.installed  ## run everything that has a YAML file for a second or two (under 10 minutes)
+	scripts/run_smoke_tests.sh
+
+performance: $(VENV)/.installed  ## the performance tests of minutes (TIER=nightly: hours, release: all)
+	scripts/run_performance_tests.sh --tier $(or $(TIER),pr)
 
 .venv-myosuite/.installed: pyproject.toml constraints-myosuite.txt
 	$(PYTHON) -m venv .venv-myosuite

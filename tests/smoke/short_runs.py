@@ -1,0 +1,140 @@
+"""What to run, found from the YAML files and the registry, and how to run it in a second or two."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import hydra
+import pytest
+from omegaconf import OmegaConf
+
+from scilab_rl import assembly, config, experiment
+from scilab_rl.algorithms.compatibility import check_pair
+from scilab_rl.envs.ids import FAMILIES
+from scilab_rl.envs.registration import module_of
+from scilab_rl.envs.vectorize import EnvSettings, make_single_env
+from scilab_rl.errors import ConfigError, MissingDependencyError
+from scilab_rl.performance.conditions import performance_tests
+from scilab_rl.results import RunDirectory, RunResult
+from scilab_rl.workspace import config_files, open_desk
+
+SHORT = (
+    "eval_after_n_steps=40",
+    "n_epochs=1",
+    "n_test_rollouts=1",
+    "mlflow=0",
+    "seed=1",
+    "vector=inprocess",
+    "++tracking.console.enabled=false",
+)
+EPISODE = "++env_kwargs.max_episode_steps=20"
+# Upper limits of what an algorithm may have; so each run does updates, small ones.
+_LIMITS = {
+    "batch_size": 16,
+    "buffer_size": 1000,
+    "learning_starts": 25,
+    "n_epochs": 2,
+    "gradient_steps": 2,
+    "n_steps": 32,
+    "train_freq": 4,
+}
+
+
+def algorithms() -> list[str]:
+    """Return every algorithm that has a YAML, of the framework and of the desk."""
+    return sorted(config_files("algorithm"))
+
+
+def environments() -> list[str]:
+    """Return every environment that is shipped, on the desk, or named in a YAML file."""
+    before = set(gym.registry)
+    open_desk()
+    found = {family.env_id for family in FAMILIES}
+    found |= {i for i in set(gym.registry) - before if module_of(gym.spec(i)).startswith("custom_")}
+    for group in ("performance", "search", "tuned_values"):
+        for path in config_files(group).values():
+            found |= {str(OmegaConf.load(path).get("env", ""))}
+    return sorted(found - {""})
+
+
+@contextlib.contextmanager
+def missing_packages_skip() -> Iterator[None]:
+    """Turn an optional package that is not installed into a skip with its reason."""
+    try:
+        yield
+    except MissingDependencyError as error:
+        pytest.skip(str(error))
+
+
+def compose(*overrides: str) -> Any:
+    """Compose a configuration with small values for what its algorithm has."""
+    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"), \
+         missing_packages_skip():  # fmt: skip
+        algorithm = config.compose(overrides).algorithm
+        small = [
+            f"++algorithm.{key}={min(limit, algorithm[key])}"
+            for key, limit in _LIMITS.items()
+            if isinstance(algorithm.get(key), int)
+            and not isinstance(algorithm[key], bool)
+            # Stable-Baselines3's off-policy n_steps is the length of returns, not of rollouts.
+            and not (key == "n_steps" and algorithm[key] < limit)
+        ]
+        return config.compose([*overrides, *small])
+
+
+def train(base: Path, *overrides: str) -> RunResult:
+    """Train in this process: imports are paid once for all runs."""
+    cfg = compose(*SHORT, f"base_logdir={base}", *overrides)
+    with missing_packages_skip():
+        return experiment.run(cfg, list(overrides))
+
+
+def finished_well(result: RunResult, *, n_steps: int = 40) -> bool:
+    """Tell whether a run has ended as it should and has left its files."""
+    run = RunDirectory(Path(result.run_dir))
+    files = ("config.yaml", "metrics.csv", "provenance.json", "rl_model_finished/manifest.json")
+    return (
+        result.status in ("finished", "stopped_early")
+        and result.steps >= n_steps
+        and "eval/mean_reward" in result.metrics
+        and all((run / name).is_file() for name in files)
+    )
+
+
+def fitting_algorithm(env_id: str, *overrides: str) -> str:
+    """Return the first one-file algorithm whose spaces fit an environment."""
+    cfg = compose(f"env={env_id}", *overrides)
+    with missing_packages_skip():
+        cfg = assembly.complete(cfg)
+        env = make_single_env(assembly.env_settings(cfg))
+    for name in ("cleansac", "cleandqn", "cleanppo"):
+        cls = assembly.algorithm_class(compose(f"algorithm={name}"))
+        with contextlib.suppress(ConfigError):
+            check_pair(name, cls, cfg.env, env)
+            env.close()
+            return name
+    raise AssertionError(f"no algorithm fits {env_id}")
+
+
+def fitting_environment(algorithm: str) -> str:
+    """Return the first tiny environment whose spaces fit an algorithm."""
+    with missing_packages_skip():
+        cls = assembly.algorithm_class(compose(f"algorithm={algorithm}"))
+    names = ("TinyReach", "TinyReachDiscrete", "TinyBox", "TinyDiscrete")
+    for env_id in (f"scilab_rl.testing:{name}-v0" for name in names):
+        with contextlib.suppress(ConfigError):
+            check_pair(algorithm, cls, env_id, make_single_env(EnvSettings(env_id)))
+            return env_id
+    raise AssertionError(f"no tiny environment fits {algorithm}")
+
+
+def tests_and_searches() -> tuple[list[str], list[str]]:
+    """Return the performance tests, and the searches as ``group=name``."""
+    tests = sorted(performance_tests())
+    searches = [f"search={name}" for name in sorted(config_files("search"))]
+    others = sorted(set(config_files("performance")) - set(tests))
+    return tests, [*searches, *(f"performance={name}" for name in others)]
