@@ -172,6 +172,17 @@ def test_study_command_shows_and_keeps_the_winner(finished: Path) -> None:
     shutil.rmtree(finished / "conf")
 
 
+def test_runs_in_another_version_of_the_environment_are_told(finished: Path) -> None:
+    first = finished / runs_of(study_of(finished, "mine"))[0].run_dir / "provenance.json"
+    kept = first.read_text()
+    first.write_text(json.dumps(json.loads(kept) | {"fingerprint": "0123456789abcdef"}))
+    shown = scilab_rl("study", "mine", cwd=finished)
+    first.write_text(kept)
+    assert shown.returncode == 0, shown.stderr
+    assert "did not behave the same in these runs" in shown.stderr
+    assert "did not behave" not in scilab_rl("study", "mine", cwd=finished).stderr
+
+
 def test_f12_crashed_runs_give_exit_code_3_and_the_others_go_on(tmp_path: Path) -> None:
     done = scilab_rl(
         *TINY_RUNS, "algorithm.learning_starts=10", "algorithm.batch_size=16",

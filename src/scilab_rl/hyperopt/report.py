@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,7 +16,11 @@ from scilab_rl.hyperopt.folders import REPORT, TABLE, TUNED_FILE, WINNER_FILE
 from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.space import override_text
 from scilab_rl.hyperopt.summary import Summary, summarize
+from scilab_rl.provenance import fingerprint_differences
+from scilab_rl.results import RunDirectory
 from scilab_rl.tracking.console import print_table
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,10 @@ def write_report(ledger: Ledger) -> Report:
 
     summary = summarize(ledger)
     directory = ledger.directory
+    # Runs on other machines, or after an update, may have seen another environment.
+    runs = [RunDirectory(Path(run.run_dir)) for run in summary.runs if run.run_dir]
+    for line in fingerprint_differences(runs):
+        _log.warning(line)
     write_text(directory / TABLE, summary.table())
     if summary.winner is not None:
         write_text(directory / TUNED_FILE, tuned_values(summary))
