@@ -251,6 +251,8 @@ def prepare_jax(device: str) -> Any:
         flags = os.environ.get("XLA_FLAGS", "")
         if "xla_cpu_multi_thread_eigen" not in flags:
             os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
+    # A run takes the memory that it needs, so that several share a GPU, also with PyTorch.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "scilab-rl" / "jax"
     try:
         cache.mkdir(parents=True, exist_ok=True, mode=0o700)
