@@ -1,0 +1,102 @@
+"""The keys of performance tests, and what is said about wrong ones."""
+
+from __future__ import annotations
+
+import pytest
+
+from scilab_rl.errors import ConfigError
+from scilab_rl.performance.conditions import Conditions, performance_tests, read_conditions, select
+from scilab_rl.performance.gate import BoundedTest, ReferenceRule, SequentialTest
+
+REFERENCE = {
+    "total_runs": 3,
+    "succ_runs": 2,
+    "eval_columns": "eval/success_rate",
+    "eval_value": 0.9,
+    "max_steps": 10_000,
+}
+
+
+def test_the_references_keys_make_a_sequential_test() -> None:
+    conditions = read_conditions(REFERENCE, "t")
+    assert conditions.make_rule() == SequentialTest(0.9, 0.1)
+    assert conditions.stop_value == pytest.approx(0.95)
+    assert read_conditions([REFERENCE], "t") == conditions  # a list with one entry
+
+
+def test_other_rules() -> None:
+    old = read_conditions({**REFERENCE, "rule": "reference"}, "t")
+    assert old.make_rule() == ReferenceRule(0.9, 2, 3)
+    assert old.stop_value == 0.9
+    safe = read_conditions({**REFERENCE, "rule": "bounded", "max_runs": 50}, "t")
+    assert safe.make_rule() == BoundedTest(0.9, 0.1, max_runs=50)
+
+
+def test_the_margin_of_a_reward_is_a_tenth_of_it() -> None:
+    conditions = Conditions(-160, 1000, "eval/mean_reward")
+    assert conditions.width == 16
+    assert conditions.stop_value == -152
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"sucs_runs": 2}, "Did you mean 'succ_runs'?"),
+        ({"eval_value": None}, "needs eval_value"),
+        ({"max_steps": 0}, "max_steps must be a whole number from 1"),
+        ({"succ_runs": 4}, r"succ_runs \(4\) must not be above total_runs"),
+        ({"eval_value": 1.2}, "must be at most 1"),
+        ({"eval_value": 0.1}, "more than the margin"),
+        ({"rule": "sometimes"}, "one of sequential, bounded, reference"),
+        ({"margin": 0}, "a number above 0"),
+        ({"alpha": 0.7}, "between 0 and 0.5"),
+        ({"max_runs": 2}, "must not be below min_runs"),
+        ({"eval_columns": "train/loss"}, "a metric of the evaluation"),
+        ({"rule": "bounded", "eval_columns": "eval/mean_reward"}, "take sequential"),
+        ({"tier": "weekly"}, "one of pr, nightly, release"),
+        ({"n_episodes": "many"}, "n_episodes must be a whole number"),
+    ],
+)
+def test_mistakes_are_named(change: dict, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        read_conditions({**REFERENCE, **change}, "FetchReach/sac_her-test")
+
+
+def test_no_mapping_is_no_condition() -> None:
+    with pytest.raises(ConfigError, match="must be a mapping"):
+        read_conditions("0.9", "t")
+
+
+def test_every_row_of_the_reference_is_there() -> None:
+    names = set(performance_tests())
+    for group, tests in {
+        "FetchReach": "sac_her cleansac_her td3_her ddpg_her dense-ppo dense-cleanppo",
+        "FetchPush": "sac_her cleansac_her",
+        "FetchPickAndPlace": "sac_her",
+        "FetchSlide": "sac_her",
+        "Blocks": " ".join(
+            f"{task}-{algorithm}"
+            for task in ("o0-random", "o1-none", "o1-above", "o1-random")
+            for algorithm in ("sac_her", "cleansac_her")
+        ),
+        "Parking": "limited-sac_her limited-cleansac_her",
+        "PointGym": "small_open-cleansac_her medium_custom-cleansac_her",
+        "PointObjGym": "o4-cleansac_her",
+        "AntGym": "small_open-cleansac_her small_open-long-cleansac_her",
+        "MetaW-drawer-close": "ppo cleanppo",
+        "MetaW-pick-place": "sac",
+        "CartPole": "dqn cleandqn cleanppo onestepac",
+        "LunarLander": "dqn cleandqn",
+        "MountainCar": "dqn cleandqn",
+        "BipedalWalker": "ppo cleanppo",
+        "Reach1DOF": "actor_critic",
+    }.items():
+        assert {f"{group}/{test}-test" for test in tests.split()} <= names
+
+
+def test_tests_are_selected_by_name_and_tier() -> None:
+    assert "FetchReach/sac_her-test" in select(["fetchreach"], None)
+    pr, nightly, everything = (set(select([], tier)) for tier in ("pr", "nightly", None))
+    assert pr < nightly < everything
+    with pytest.raises(ConfigError, match="No performance test fits 'FetchReech'"):
+        select(["FetchReech"], None)
