@@ -46,8 +46,29 @@ def prepare_torch(cfg: DictConfig) -> None:
     """Set threads and seeds before anything draws a random number."""
     import torch
 
+    _check_device(cfg.device)
     torch.set_num_threads(cfg.n_threads)
     seed_everything(cfg.seed)
+
+
+def _check_device(name: str) -> None:
+    """Refuse a device that is not here; some libraries would silently take the CPU instead."""
+    import torch
+
+    if name == "auto":
+        return
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ConfigError(
+            f"device must be auto, cpu, cuda, cuda:NUMBER or mps, but it is {name!r}; device=cpu "
+            "always works."
+        ) from error
+    n_devices = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= n_devices:
+        raise ConfigError(
+            f"device={name}: PyTorch finds {n_devices or 'no'} GPUs here. Use device=cpu or auto."
+        )
 
 
 def make_environments(cfg: DictConfig) -> tuple[Any, Any]:

@@ -46,8 +46,7 @@ _HYDRA_FLAGS = (
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line and exit with its code."""
-    if sys.stdout is None:  # started with stdout closed
-        sys.stdout = Path(os.devnull).open("w")
+    _fill_closed_streams()
     sys.exit(run_command_line(list(sys.argv[1:] if arguments is None else arguments)))
 
 
@@ -68,7 +67,7 @@ def run_command_line(arguments: list[str]) -> int:
     except ScilabRLError as error:
         if debug:
             traceback.print_exc()
-        sys.stderr.write(f"error: {mask(' '.join(str(error).split()))}\n")
+        sys.stderr.write(f"error: {_one_line(error)}\n")
         return error.exit_code
     except KeyboardInterrupt:
         sys.stderr.write("interrupted\n")
@@ -79,11 +78,31 @@ def run_command_line(arguments: list[str]) -> int:
     except Exception as error:
         if debug:
             raise
-        message = mask(" ".join(str(error).split()))
         sys.stderr.write(
-            f"error: {type(error).__name__}: {message} (unexpected; --debug shows the traceback)\n"
+            f"error: {type(error).__name__}: {_one_line(error)} (unexpected; --debug shows the "
+            "traceback)\n"
         )
         return 1
+
+
+def _fill_closed_streams() -> None:
+    """Give a process that was started without standard streams ones that lead nowhere.
+
+    Otherwise the first files that it opens would get their numbers, and what is printed.
+    """
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    if sys.stdout is None:
+        sys.stdout = Path(os.devnull).open("w")
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w")
+
+
+def _one_line(error: Exception) -> str:
+    """Return what an error says, without secrets and without control characters."""
+    line = mask(" ".join(str(error).split()))
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
 
 
 def _dispatch(arguments: list[str]) -> int:

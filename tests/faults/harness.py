@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
+import importlib.util
 import json
 import multiprocessing
 import os
@@ -84,6 +85,7 @@ class Process:
         disk: Size of the disk that ``data`` is then, as ``mount`` wants it; ``read-only`` for one
             that cannot be written.
         network: Whether it has one.
+        hidden: Packages that cannot be imported.
         variables: More of the environment.
     """
 
@@ -93,6 +95,7 @@ class Process:
     file_limit: int | None = None
     disk: str = ""
     network: bool = True
+    hidden: tuple[str, ...] = ()
     variables: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -145,12 +148,37 @@ def _main(settings: dict[str, Any]) -> None:
     if settings["file_limit"] is not None:
         signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
         resource.setrlimit(resource.RLIMIT_FSIZE, (settings["file_limit"],) * 2)
+    for package in settings["hidden"]:
+        _hide(package)
     from scilab_rl.cli import run_command_line
 
     sys.argv = ["scilab-rl", *settings["arguments"]]
     code = run_command_line(list(settings["arguments"]))
     sys.stdout.flush()
     sys.exit(code)
+
+
+class _Hidden:
+    """Makes a package look as if it were not installed."""
+
+    def __init__(self, package: str) -> None:
+        self.package = package
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> None:
+        if name.partition(".")[0] == self.package:
+            raise ModuleNotFoundError(f"No module named '{self.package}'", name=self.package)
+
+
+def _hide(package: str) -> None:
+    for name in [name for name in sys.modules if name.partition(".")[0] == package]:
+        del sys.modules[name]
+    sys.meta_path.insert(0, _Hidden(package))  # type: ignore[arg-type]
+    found = importlib.util.find_spec
+
+    def find_spec(name: str, *rest: Any) -> Any:
+        return None if name.partition(".")[0] == package else found(name, *rest)
+
+    importlib.util.find_spec = find_spec
 
 
 def _enter_namespaces(disk: str, network: bool) -> None:

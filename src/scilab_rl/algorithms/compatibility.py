@@ -76,9 +76,11 @@ def check_pair(
     allowed = supported_action_spaces(cls)
     action_space, observation_space = env.action_space, env.observation_space
     if allowed is not None and not isinstance(action_space, allowed):
+        others = ", ".join(fitting())
         raise ConfigError(
             f"{name} needs {_names(allowed)} actions, but {env_id} has "
-            f"{type(action_space).__name__} actions. These can: {', '.join(fitting())}."
+            f"{type(action_space).__name__} actions. "
+            + (f"These can: {others}." if others else "None of the algorithms can.")
         )
     if isinstance(action_space, spaces.Box) and not action_space.is_bounded():
         raise ConfigError(
