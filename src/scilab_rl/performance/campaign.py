@@ -251,10 +251,11 @@ class Campaign:
         test = self.tests[index]
         verdict = self.results[index].verdict(self.rules[index])
         told = f"{run.value:.3g}" if run.value is not None else f"FAILED: {run.error}"
+        mean = f"mean {verdict.mean:.3g} of {verdict.n_runs}" if verdict.n_runs else "no mean yet"
         _log.info(
-            "%s, run %d: %s after %s steps and %.0f s. Mean %.3g of %d, %.3g needed: %s.",
-            test.name, run.number + 1, told, f"{run.steps:,}", run.seconds, verdict.mean,
-            verdict.n_runs, test.conditions.eval_value, verdict.outcome,
+            "%s, run %d: %s after %s steps and %.0f s; %s, %.3g needed: %s.",
+            test.name, run.number + 1, told, f"{run.steps:,}", run.seconds, mean,
+            test.conditions.eval_value, verdict.outcome,
         )  # fmt: skip
 
 
