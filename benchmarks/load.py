@@ -3,8 +3,8 @@
 * ``study``: 200 short trials on two workers; every 5 to 20 seconds a worker or the parent is
   killed, and the same command is given again. Bar: exactly 200 runs are accounted for.
 * ``mlflow``: 20 runs at the same time on one MLflow database. Bar: nothing is lost.
-* ``steps``: two million steps of one run. Bar: memory is flat after the first tenth, and files
-  grow by a line per episode and a row per epoch.
+* ``steps``: two million steps of one run with eight environments. Bar: memory is flat after the
+  first tenth, and files grow by a line per episode and a row per epoch.
 * ``metrics``: values recorded per second, and values written per second. Bar: 10 000 each.
 
 Prints one JSON object per part.
@@ -40,22 +40,23 @@ SHORT = ("algorithm=random", ENV, "n_epochs=1", "eval_after_n_steps=30", "n_test
 _MAIN = str(Path(__file__).parents[1] / "src" / "main.py")
 
 
-def study(folder: Path, scale: float) -> dict[str, Any]:
+def study(folder: Path, scale: float, pause: float = 1.0) -> dict[str, Any]:
     """Kill workers and parents of a study until it has ended."""
     n_trials, rng, kills = max(4, int(200 * scale)), random.Random(0), Counter[str]()
     words = [
-        *SHORT, "mlflow=0", "tuned=false", "env_kwargs={}", "seed=1",
-        "early_stop_threshold=interval(0.5,1.0)", "--multirun", f"hydra.sweeper.max_trials={n_trials}",
-        "hydra.sweeper.n_jobs=2", "hydra.sweeper.min_trials_per_param=1",
+        *SHORT, "mlflow=0", "tuned=false", "early_stop_threshold=interval(0.5,1.0)", "--multirun",
+        f"hydra.sweeper.max_trials={n_trials}", "hydra.sweeper.n_jobs=2",
+        "hydra.sweeper.min_trials_per_param=1",
         "hydra.sweeper.n_final_runs=0", "hydra.sweeper.max_retries=100",
-        "hydra.sweeper.study_name=load", "hydra.sweeper.fail_fast=0", "hydra.sweeper.sampler=random",
+        "hydra.sweeper.study_name=load", "hydra.sweeper.fail_fast=0",
+        "hydra.sweeper.sampler=random",
     ]  # fmt: skip
     started, starts = time.monotonic(), 0
     process = _start(words, folder)
     code = None
     while code is None:
         try:
-            code = process.wait(rng.uniform(5, 20))
+            code = process.wait(pause * rng.uniform(5, 20))
         except subprocess.TimeoutExpired:
             workers = _children(process.pid)
             if workers and rng.random() < 0.6:
@@ -114,7 +115,8 @@ def steps(folder: Path, scale: float) -> dict[str, Any]:
     """Follow memory and files of one long run."""
     n_steps = int(2_000_000 * scale)
     words = [
-        "algorithm=random", ENV, f"n_epochs={n_steps // 10_000}", "eval_after_n_steps=10000",
+        "algorithm=random", ENV, "n_envs=8", f"n_epochs={n_steps // 10_000}",
+        "eval_after_n_steps=10000",
         "n_test_rollouts=1", "tuned=false", "mlflow=0", "seed=1", "early_stop_threshold=2",
         f"save_model_freq={n_steps // 10}",
     ]  # fmt: skip
@@ -124,9 +126,9 @@ def steps(folder: Path, scale: float) -> dict[str, Any]:
     while process.poll() is None:
         time.sleep(1.0)
         runs = list(all_runs(folder / "data"))
-        rows = read_epochs(runs[0])[-1:] if runs else []
-        if rows and (resident := _resident_mib(process.pid)):
-            samples.append((rows[0]["step"], resident))
+        step = _newest_step(runs[0] / "metrics.csv") if runs else 0
+        if step and (resident := _resident_mib(process.pid)):
+            samples.append((step, resident))
     settled = [mib for step, mib in samples if step >= n_steps * 0.1]
     (run,) = all_runs(folder / "data")
     n_episodes = sum('"episode"' in line for line in (run / "metrics.jsonl").open())
@@ -175,7 +177,7 @@ def metrics(folder: Path, scale: float) -> dict[str, Any]:
     }
 
 
-PARTS: dict[str, Callable[[Path, float], dict[str, Any]]] = {
+PARTS: dict[str, Callable[..., dict[str, Any]]] = {
     "study": study, "mlflow": mlflow, "steps": steps, "metrics": metrics,
 }  # fmt: skip
 
@@ -208,6 +210,13 @@ def _kill(pid: int) -> int:
     return 1
 
 
+def _newest_step(path: Path) -> int:
+    try:
+        return int(path.read_text().splitlines()[-1].split(",")[1])
+    except (OSError, ValueError, IndexError):
+        return 0
+
+
 def _resident_mib(pid: int) -> float:
     try:
         pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
@@ -222,10 +231,14 @@ def main() -> int:
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--scale", type=float, default=1.0, help="of the numbers above")
     parser.add_argument("--json", type=Path, help="write the figures to this file too")
+    parser.add_argument(
+        "--pause", type=float, default=1.0, help="times 5 to 20 s between kills, on slow machines"
+    )
     options = parser.parse_args()
+    more = {"pause": options.pause} if options.part == "study" else {}
     with tempfile.TemporaryDirectory() as folder:
-        figures = PARTS[options.part](Path(folder), options.scale)
-    text = json.dumps({"part": options.part, "scale": options.scale, **figures}, indent=2)
+        figures = PARTS[options.part](Path(folder), options.scale, **more)
+    text = json.dumps({"part": options.part, "scale": options.scale, **more, **figures}, indent=2)
     sys.stdout.write(text + "\n")
     if options.json:
         options.json.write_text(text + "\n", encoding="utf-8")

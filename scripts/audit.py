@@ -2,8 +2,8 @@
 
 The list (``scripts/advisories.csv``) holds advisories of packages that we or our dependencies use,
 as published until the date in its first line. It is not complete and does not grow by itself; it
-catches a pin that goes back to a version known as vulnerable, also without a network. pip-audit asks
-PyPI for all packages; what it could not look up is said, and never counts as good.
+catches a pin that goes back to a version known as vulnerable, also without a network. pip-audit
+asks PyPI for all packages; what it could not look up is said, and never counts as good.
 
 Run: python scripts/audit.py [--offline]
 """

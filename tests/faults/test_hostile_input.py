@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import io
 import json
-import os
 import pickle
 import re
 import shutil
@@ -320,7 +319,7 @@ def listeners_of(pids: set[int]) -> Iterator[tuple[str, int]]:
     for pid in pids:
         for link in Path(f"/proc/{pid}/fd").glob("*"):
             try:
-                found = re.fullmatch(r"socket:\[(\d+)\]", os.readlink(link))
+                found = re.fullmatch(r"socket:\[(\d+)\]", str(link.readlink()))
             except OSError:
                 continue
             if found:

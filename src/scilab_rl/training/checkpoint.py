@@ -69,7 +69,10 @@ def load(directory: Path) -> Snapshot:
         for name, file in stored["arrays"].items():
             if f"{_ARRAYS}/{file}" not in listed:
                 raise ValueError(f"its manifest does not list {file}")
-            arrays[name] = np.load(directory / _ARRAYS / file, mmap_mode="r", allow_pickle=False)
+            array = np.load(directory / _ARRAYS / file, mmap_mode="r", allow_pickle=False)
+            if not isinstance(array, np.ndarray):  # an archive of arrays
+                raise ValueError(f"{file} is no array")
+            arrays[name] = array
         return Snapshot(stored["tree"], load_file(directory / _TENSORS), arrays)
     except (OSError, *_MALFORMED, SafetensorError) as error:
         raise CheckpointError(f"'{directory}' cannot be read: {error}") from error
