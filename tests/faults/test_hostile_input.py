@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import base64
+import functools
+import http.client
+import http.server
 import io
 import json
 import pickle
@@ -10,6 +13,7 @@ import re
 import shutil
 import subprocess
 import sys
+import threading
 import time
 import zipfile
 from collections.abc import Iterator
@@ -447,3 +451,54 @@ def test_no_pickle_is_read_in_the_package() -> None:
     }
     assert found <= allowed, found
     assert sys.version_info >= (3, 10)
+
+
+@pytest.fixture
+def served(tmp_path: Path) -> Iterator[int]:
+    """A page that is served as `scilab-rl view` does; yields the port."""
+    from scilab_rl.commands.view import LocalHandler
+
+    (tmp_path / "page.html").write_text("<html></html>")
+    (tmp_path / "folder").mkdir()
+    handler = functools.partial(LocalHandler, directory=str(tmp_path))
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield server.server_port
+    server.shutdown()
+    server.server_close()
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "headers", "status"),
+    [
+        ("GET", "/page.html", {"Host": "127.0.0.1:{port}"}, 200),
+        ("GET", "/page.html", {"Host": "localhost:{port}"}, 200),
+        ("GET", "/page.html", {"Host": "[::1]:{port}"}, 200),
+        ("GET", "/page.html", {"Host": "localhost", "Origin": "http://localhost:{port}"}, 200),
+        ("GET", "/page.html", {"Host": "attacker.example"}, 403),
+        ("GET", "/page.html", {"Host": "localhost.attacker.example:{port}"}, 403),
+        ("GET", "/page.html", {"Host": "localhost@attacker.example"}, 403),
+        ("GET", "/page.html", {"Host": ""}, 403),
+        ("GET", "/page.html", {"Host": "[::bad"}, 403),
+        ("GET", "/page.html", {"Host": "localhost", "Origin": "https://attacker.example"}, 403),
+        ("GET", "/page.html", {"Host": "localhost", "Origin": "null"}, 403),
+        ("GET", "/", {"Host": "localhost"}, 404),
+        ("GET", "/folder/", {"Host": "localhost"}, 404),
+        ("GET", "/../../../../etc/passwd", {"Host": "localhost"}, 404),
+        ("GET", "/%2e%2e/%2e%2e/%2e%2e/etc/passwd", {"Host": "localhost"}, 404),
+        ("POST", "/page.html", {"Host": "localhost"}, 501),
+        ("DELETE", "/page.html", {"Host": "localhost"}, 501),
+    ],
+)
+def test_f34_pages_for_this_machine_alone(
+    method: str, path: str, headers: dict[str, str], status: int, served: int
+) -> None:
+    connection = http.client.HTTPConnection("127.0.0.1", served, timeout=10)
+    connection.putrequest(method, path, skip_host=True)
+    for name, value in headers.items():
+        connection.putheader(name, value.format(port=served))
+    connection.endheaders()
+    answer = connection.getresponse()
+    answer.read()
+    connection.close()
+    assert answer.status == status

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import argparse
 import functools
+import http
 import http.server
 import importlib.util
 import logging
+import urllib.parse
 import webbrowser
 from pathlib import Path
+from typing import Any
 
 from scilab_rl.commands.parser import CommandParser
 from scilab_rl.errors import ConfigError, did_you_mean
@@ -24,6 +27,7 @@ from scilab_rl.visualization.live import (
 )
 
 _log = logging.getLogger(__name__)
+_LOCAL_NAMES = (LOOPBACK, "localhost", "::1")
 
 
 def main(arguments: list[str]) -> int:
@@ -97,16 +101,42 @@ def show(recording: Path, *, in_browser: bool) -> None:
 def _serve(page: Path) -> None:
     """Serve the pages of a run to this machine until Ctrl-C."""
     port = free_port(PAGE_PORT)
-    handler = functools.partial(_QuietHandler, directory=str(page.parent))
+    handler = functools.partial(LocalHandler, directory=str(page.parent))
     with http.server.ThreadingHTTPServer((LOOPBACK, port), handler) as server:
         _log.info("There is no display here. Open http://%s:%d/%s", LOOPBACK, port, page.name)
         _log.info("%s   (end with Ctrl-C)", ssh_line(port))
         server.serve_forever()
 
 
-class _QuietHandler(http.server.SimpleHTTPRequestHandler):
+class LocalHandler(http.server.SimpleHTTPRequestHandler):
+    """Gives files to a browser on this machine that asks for them by this machine's name.
+
+    A web page from elsewhere could let its own name point to 127.0.0.1 and read what is served here
+    (DNS rebinding); its name then stands in the request.
+    """
+
+    def send_head(self) -> Any:
+        """Begin the answer, or refuse."""
+        asked_for = [f"//{self.headers.get('Host', '')}", self.headers.get("Origin")]
+        if not all(address is None or _is_local(address) for address in asked_for):
+            self.send_error(http.HTTPStatus.FORBIDDEN)
+            return None
+        return super().send_head()
+
+    def list_directory(self, path: Any) -> None:
+        """Refuse: only the pages themselves are served."""
+        self.send_error(http.HTTPStatus.NOT_FOUND)
+
     def log_message(self, format: str, *args: object) -> None:
+        """Write requests to the log."""
         _log.debug(format, *args)
+
+
+def _is_local(address: str) -> bool:
+    try:
+        return urllib.parse.urlsplit(address).hostname in _LOCAL_NAMES
+    except ValueError:  # no address at all
+        return False
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:

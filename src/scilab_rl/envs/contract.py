@@ -133,7 +133,7 @@ class ContractGuard(gym.Wrapper):
             )
         if dtype is None or dtype != self._accepted_types.get(key):
             dtype = np.asarray(value).dtype
-            if not np.can_cast(dtype, space.dtype, "same_kind"):
+            if space.dtype is not None and not np.can_cast(dtype, space.dtype, "same_kind"):
                 raise BrokenContractError(
                     f"{name} is of type {dtype}, but its space of {space.dtype}{last_action}"
                 )
