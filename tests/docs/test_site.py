@@ -1,0 +1,80 @@
+"""The site: built without a warning, complete, and without anything from elsewhere."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from scilab_rl.cli import COMMANDS
+from scilab_rl.config import KEYS
+from scilab_rl.metrics.probes import PROBE_NAMES
+from scilab_rl.workspace import config_files
+
+from ..e2e.commands import quiet_environment
+from .pages import ROOT, pages
+
+# What a browser would fetch without being asked.
+_FETCHED = re.compile(
+    r"<(?:script|img|iframe|source)[^>]+src=\"?(https?:[^\" >]+)"
+    r"|<link[^>]+href=\"?(https?:[^\" >]+)"
+)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pytest.importorskip("material", reason="needs the extra [docs]")
+    folder = tmp_path_factory.mktemp("site")
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--quiet", "--strict", "--site-dir", str(folder)],
+        cwd=ROOT, env=quiet_environment(NO_MKDOCS_2_WARNING="1"), capture_output=True, text=True,
+        check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert not re.search(r"WARNING|ERROR", done.stderr), done.stderr
+    return folder
+
+
+def text_of(page: Path) -> str:
+    return page.read_text(encoding="utf-8")
+
+
+def test_nothing_is_fetched_from_elsewhere(site: Path) -> None:
+    fetched = {found for page in site.rglob("*.html") for found in _FETCHED.findall(text_of(page))}
+    assert {a or b for a, b in fetched if "canonical" not in a + b} == set()
+    styles = "".join(text_of(path) for path in site.rglob("*.css"))
+    assert not re.search(r"url\([\"']?https?:", styles)
+
+
+def test_reference_is_complete(site: Path) -> None:
+    keys = text_of(site / "reference" / "keys.html")
+    assert [key.name for key in KEYS if f"<code>{key.name}</code>" not in keys] == []
+    commands = text_of(site / "reference" / "commands.html")
+    assert [name for name in COMMANDS if f'id="{name}"' not in commands] == []
+    metrics = text_of(site / "reference" / "metrics.html")
+    assert [name for name in PROBE_NAMES if f"<code>{name}</code>" not in metrics] == []
+    algorithms = text_of(site / "reference" / "algorithms.html")
+    shipped = config_files("algorithm")
+    assert [name for name in shipped if f'id="{name}"' not in algorithms] == []
+    api = text_of(site / "reference" / "api.html")
+    assert "OneFileAlgorithm" in api and "sample_goal" in api
+
+
+def test_external_links_are_well_formed_and_few_hosts() -> None:
+    """They are listed, not fetched: a test must not depend on other people's servers."""
+    links = {
+        link for page in pages() for link in re.findall(r"\]\((https?://[^)\s]+)\)", text_of(page))
+    }
+    hosts = {link.split("/")[2] for link in links}
+    assert hosts <= {"arxiv.org", "github.com"}, hosts
+
+
+def test_every_picture_is_used_somewhere() -> None:
+    texts = "".join(text_of(page) for page in [*pages(), ROOT / "README.md"])
+    texts += "".join(text_of(p) for p in (ROOT / "docs").rglob("*.py"))
+    figures = sorted((ROOT / "docs" / "images").glob("figure_*.png"))
+    assert figures
+    assert [path.name for path in figures if path.name not in texts] == []
