@@ -2,12 +2,14 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim
+EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim,jax,docs
 # Two cores learn as fast as one on small networks, but two test workers halve the waiting.
 WORKERS ?= 2
+# Further settings of `make demo`, such as DEMO=n_epochs=1.
+DEMO ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check format test test-slow smoke performance test-myosuite demo figure-fetchpush mlflow clean-venv
+.PHONY: help setup check format test test-slow smoke performance test-myosuite demo docs docs-figures gallery figure-fetchpush mlflow audit clean-venv
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -23,7 +25,7 @@ setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
 
 demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 5 minutes)
-	$(BIN)/python src/main.py algorithm=sac env=FetchReach-v4 seed=1
+	$(BIN)/python src/main.py algorithm=sac env=FetchReach-v4 seed=1 $(DEMO)
 	$(BIN)/python src/main.py play last --episodes 20 --record
 
 check: $(VENV)/.installed  ## format, lint, types and import layers, as CI runs them
@@ -56,6 +58,15 @@ performance: $(VENV)/.installed  ## the performance tests of minutes (TIER=night
 test-myosuite: .venv-myosuite/.installed  ## the tests of MyoSuite, in a virtual environment of its own
 	.venv-myosuite/bin/python -m pytest tests/unit/envs/suites/test_myosuite.py
 
+docs: $(VENV)/.installed  ## build the documentation into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --quiet --strict
+
+docs-figures: $(VENV)/.installed  ## draw the figures of the documentation
+	$(BIN)/python -m docs.figures
+
+gallery: setup  ## film every family of environments and algorithms, see docs/gallery.md (about 20 minutes)
+	$(BIN)/python docs/figures/gallery.py
+
 figure-fetchpush: setup  ## the paper's figure: critic variance while the block falls (about 10 minutes)
 	$(BIN)/python src/main.py algorithm=sac_var env=FetchPush-v1 seed=1 n_epochs=6 n_test_rollouts=5 \
 	  algorithm.n_critics=4 algorithm.weight_critic_var=0.25 algorithm.learning_rate=1e-3 \
@@ -64,6 +75,9 @@ figure-fetchpush: setup  ## the paper's figure: critic variance while the block 
 
 mlflow: $(VENV)/.installed  ## browse the recorded runs on http://127.0.0.1:5000
 	$(BIN)/mlflow ui --host 127.0.0.1 --port 5000 --backend-store-uri sqlite:///data/mlflow.db
+
+audit: $(VENV)/.installed  ## compare the pinned versions with known vulnerabilities
+	@$(BIN)/python scripts/audit.py
 
 clean-venv:  ## remove .venv (nothing else)
 	rm -rf $(VENV)

@@ -115,14 +115,12 @@ def clone(folder: Path) -> Path:
 
 def install(desk: Path) -> None:
     """Do what ``make setup`` does, with the packages of the running environment."""
-    subprocess.run([sys.executable, "-m", "venv", str(desk / ".venv")], check=True)
+    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(desk / ".venv")], check=True)
     (site,) = (desk / ".venv").glob("lib/python*/site-packages")
     (site / "outer.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
-    python = str(desk / ".venv" / "bin" / "python")
+    pip = [sys.executable, "-m", "pip", "--python", str(desk / ".venv" / "bin" / "python")]
     offline = ["--no-deps", "--no-index", "--no-build-isolation", "--quiet"]
-    subprocess.run(
-        [python, "-m", "pip", "install", *offline, "-e", str(desk)], check=True, cwd=desk
-    )
+    subprocess.run([*pip, "install", *offline, "-e", str(desk)], check=True, cwd=desk)
     (desk / ".venv" / ".installed").touch()
 
 
