@@ -7,6 +7,7 @@ import os
 import pty
 import re
 import runpy
+import shutil
 import subprocess
 import sys
 import time
@@ -253,3 +254,19 @@ def test_no_pin_is_known_as_vulnerable() -> None:
     problems, _ = audit["known_problems"](old)
     assert len(problems) == 2
     assert "CVE-2025-32434" in problems[0]
+
+
+GOLDEN = Path(__file__).parent / "golden"
+
+
+@pytest.mark.parametrize("release", sorted(path.name for path in GOLDEN.iterdir()))
+def test_f38_runs_of_every_release_can_be_played_and_resumed(release: str, tmp_path: Path) -> None:
+    """Each release leaves a small run here; a new format must go on reading it."""
+    run = tmp_path / "data" / "2026-01-01" / f"run-of-{release}"
+    shutil.copytree(GOLDEN / release, run)
+    played = scilab_rl("play", str(run / "rl_model_finished"), "--episodes", "1", cwd=tmp_path)
+    assert played.code == 0, played.errors
+    resumed = scilab_rl("resume", str(run), cwd=tmp_path)
+    assert resumed.code == 0, resumed.errors
+    result = result_of(run)
+    assert (result["status"], result["steps"]) == ("finished", 64)
