@@ -21,10 +21,10 @@ from scilab_rl import assembly, config
 from scilab_rl.errors import ScilabRLError
 from scilab_rl.hyperopt.jobs import JobPool
 from scilab_rl.hyperopt.pool import Pool, n_cores
-from scilab_rl.hyperopt.space import override_text
 from scilab_rl.hyperopt.worker import Message, Task
 from scilab_rl.performance.conditions import KEY, REFERENCE, Conditions, read_conditions
 from scilab_rl.performance.gate import OPEN
+from scilab_rl.performance.identity import identity_of
 from scilab_rl.performance.results import TestResult, TestRun, load_result
 from scilab_rl.provenance import PROVENANCE_FILE
 from scilab_rl.results import RunDirectory, read_epochs
@@ -34,11 +34,6 @@ _log = logging.getLogger(__name__)
 _POLL_SECONDS = 0.5
 _MOST_ATTEMPTS = 3  # when the machine, and not the run, is to blame
 _SOURCES = ("algorithms", "training", "envs", "metrics")
-# What does not change what a run learns.
-_FREE_KEYS = (
-    "seed", "base_logdir", "info", "mlflow", "wandb", "tensorboard", "project_name", "entity",
-    "group", "tags", "render", "render_freq", "device", "n_threads", "tracking",
-)  # fmt: skip
 
 
 class CampaignInterrupted(ScilabRLError):
@@ -99,15 +94,15 @@ def read_test(
         ConfigError: If the test cannot work.
     """
     cfg = config.compose(overrides)
-    given = OmegaConf.to_container(cfg[KEY], resolve=True)
+    given: Any = OmegaConf.to_container(cfg[KEY], resolve=True)
     if isinstance(given, list) and given:
         given = given[0]
     if isinstance(given, dict):
         given = {**given, **(changes or {})}
     conditions = read_conditions(given, name)
-    cfg = assembly.complete(cfg)
     epoch_steps = min(cfg.eval_after_n_steps, conditions.max_steps)
-    fixed = (
+    words = (
+        *overrides,
         f"eval_after_n_steps={epoch_steps}",
         f"n_epochs={math.ceil(conditions.max_steps / epoch_steps)}",
         f"early_stop_data_column={conditions.eval_columns}",
@@ -116,17 +111,14 @@ def read_test(
         f"group={cfg.group or name.replace('/', '_')}",
         "++tracking.console.enabled=false",  # many runs at once: the tests report for them
     )
+    cfg = assembly.complete(config.compose(words))
     definition = {
         "conditions": dataclasses.asdict(conditions),
-        "configuration": {
-            key: override_text(value)
-            for key, value in config.flat(cfg).items()
-            if key.partition(".")[0] not in _FREE_KEYS
-        },
+        "configuration": identity_of(OmegaConf.to_container(cfg, resolve=True)),
         "code": code_digest(),
     }
     return PerformanceTest(
-        name, (*overrides, *fixed), conditions, cfg.env, cfg.algorithm.name, Path(cfg.base_logdir),
+        name, words, conditions, cfg.env, cfg.algorithm.name, Path(cfg.base_logdir),
         json.loads(json.dumps(definition)),
     )  # fmt: skip
 

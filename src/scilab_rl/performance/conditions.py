@@ -93,7 +93,10 @@ class Conditions:
         budget = {} if self.max_runs is None else {"max_runs": self.max_runs}
         if self.rule == BOUNDED:
             return BoundedTest(self.eval_value, self.width, self.alpha, **budget)
-        return SequentialTest(self.eval_value, self.width, self.alpha, self.min_runs, **budget)
+        limits = (0.0, 1.0) if self.is_rate else (-math.inf, math.inf)
+        return SequentialTest(
+            self.eval_value, self.width, self.alpha, self.min_runs, limits=limits, **budget
+        )
 
 
 def read_conditions(given: Any, name: str) -> Conditions:

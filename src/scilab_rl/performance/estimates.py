@@ -151,7 +151,7 @@ def permutation_test(ours: Scores, theirs: Scores, *, paired: bool, seed: int = 
         signs = _all_or_some_signs(len(changes), rng)
         totals = signs @ changes
     else:
-        totals = sum(  # type: ignore[assignment]
+        totals = sum(
             _reassigned(a, b, rng, exact=len(ours) == 1) for a, b in zip(ours, theirs, strict=True)
         )
     return float(np.mean(np.abs(totals) >= observed - 1e-12))

@@ -106,6 +106,7 @@ class SequentialTest:
         alpha: Probability of each of the two mistakes.
         min_runs: Runs before the first decision, at least 2.
         max_runs: The budget; afterwards the answer is ``inconclusive``.
+        limits: What a mean can be, for its interval.
     """
 
     required: float
@@ -113,15 +114,16 @@ class SequentialTest:
     alpha: float = 0.05
     min_runs: int = 3
     max_runs: int = 14
+    limits: tuple[float, float] = (-math.inf, math.inf)
 
     def outcomes(self, runs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the outcome of each test and how many runs it used; see `Rule`."""
         counts, means, spreads = _running_moments(runs[:, : self.max_runs])
         errors = np.maximum(spreads, self.margin / 2) / np.sqrt(counts)
         bounds = np.full(len(counts), np.inf)
-        limits = boundary(self.alpha, self.min_runs, self.max_runs)
         first = self.min_runs - 1
-        bounds[first:] = limits[: max(len(counts) - first, 0)]
+        needed = boundary(self.alpha, self.min_runs, self.max_runs)
+        bounds[first:] = needed[: max(len(counts) - first, 0)]
         with np.errstate(invalid="ignore"):  # nothing is decided where the bound is infinite
             above = (means - (self.required - self.margin)) / errors >= bounds
             below = (self.required - means) / errors >= bounds
@@ -139,7 +141,8 @@ class SequentialTest:
         spread = max(float(np.std(values, ddof=1)), self.margin / 2)
         limit = boundary(self.alpha, self.min_runs, self.max_runs)[n - self.min_runs]
         half = float(limit) * spread / math.sqrt(n)
-        return float(np.mean(values)) - half, float(np.mean(values)) + half
+        low, high = np.clip([np.mean(values) - half, np.mean(values) + half], *self.limits)
+        return float(low), float(high)
 
 
 @dataclass(frozen=True)

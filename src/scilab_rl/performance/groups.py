@@ -4,25 +4,19 @@ from __future__ import annotations
 
 import glob
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.hyperopt.folders import STUDIES, study_names
+from scilab_rl.performance.identity import identity_of
 from scilab_rl.results import CONFIG_FILE, RunDirectory, all_runs, find_run, read_epochs
 
 _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 FAILED, UNFINISHED = "failed", ("running", "interrupted")
-# What does not change what a run learns or how it is measured.
-_FREE_KEYS = (
-    "seed", "base_logdir", "info", "mlflow", "wandb", "tensorboard", "project_name", "entity",
-    "group", "tags", "render", "render_freq", "render_metrics_train", "render_metrics_test",
-    "device", "n_threads", "tracking", "save_model_freq", "viewer_host", "record_when",
-)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -162,11 +156,6 @@ def read_record(run: RunDirectory) -> RunRecord | None:
     )
 
 
-def identity_of(config: Any) -> dict[str, str]:
-    """Return what makes a run what it is, as one level of keys: all but seed, names and places."""
-    return {k: v for k, v in _flat(config) if k.partition(".")[0] not in _FREE_KEYS}
-
-
 def _by_pattern(
     label: str, pattern: str, records: Callable[[], list[RunRecord]], base: Path
 ) -> Group:
@@ -207,11 +196,3 @@ def _of_study(label: str, name: str, base: Path) -> Group:
     found = (read_record(RunDirectory(Path(run.run_dir))) for run in unseen or of_winner)
     seeds = "seeds that the search never saw" if unseen else "the seeds of the search, flattering"
     return Group(label, f"winner of study {name}, {seeds}", tuple(r for r in found if r))
-
-
-def _flat(value: Any, prefix: str = "") -> Iterable[tuple[str, str]]:
-    if isinstance(value, dict):
-        for key, entry in value.items():
-            yield from _flat(entry, f"{prefix}.{key}" if prefix else str(key))
-    else:
-        yield prefix, json.dumps(value)

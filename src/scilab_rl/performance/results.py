@@ -77,7 +77,7 @@ class TestResult:
 
         Decisions come from these only: runs that end early are often the good ones.
         """
-        ordered = []
+        ordered: list[TestRun] = []
         while len(ordered) in self.runs:
             ordered.append(self.runs[len(ordered)])
         return ordered

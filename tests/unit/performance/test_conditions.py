@@ -19,7 +19,7 @@ REFERENCE = {
 
 def test_the_references_keys_make_a_sequential_test() -> None:
     conditions = read_conditions(REFERENCE, "t")
-    assert conditions.make_rule() == SequentialTest(0.9, 0.1)
+    assert conditions.make_rule() == SequentialTest(0.9, 0.1, limits=(0, 1))
     assert conditions.stop_value == pytest.approx(0.95)
     assert read_conditions([REFERENCE], "t") == conditions  # a list with one entry
 

@@ -105,6 +105,11 @@ def test_interval_holds_at_the_moment_of_stopping() -> None:
     assert contained / 400 >= 0.9
 
 
+def test_interval_stays_where_the_mean_can_be() -> None:
+    verdict = decide(SequentialTest(0.9, 0.1, limits=(0, 1)), [1.0, 0.99, 1.0])
+    assert verdict.low < 0.9 and verdict.high == 1.0
+
+
 def test_between_required_and_margin_the_nearer_answer_wins() -> None:
     rule = SequentialTest(0.9, 0.1, max_runs=60)
     alternating = np.array([0.004, -0.004] * 30)
