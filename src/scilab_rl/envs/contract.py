@@ -52,12 +52,14 @@ class ContractGuard(gym.Wrapper):
         self._n_steps = 0
         self._tells_bounds = True
         self._last: Any = None
+        self._action: Any = None
 
     def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
         """Begin an episode."""
+        self._action = None
         try:
             observation, info = self.env.reset(seed=seed, options=options)
-            self._check_observation(observation, "")
+            self._check_observation(observation)
         except Exception as error:
             if not self.in_worker:
                 raise
@@ -68,9 +70,10 @@ class ContractGuard(gym.Wrapper):
 
     def step(self, action: Any) -> Any:
         """Act and check what comes back."""
+        self._action = action
         try:
             result = self.env.step(action)
-            self._check_step(result, action)
+            self._check_step(result)
         except Exception as error:
             if not self.in_worker:
                 raise
@@ -84,62 +87,61 @@ class ContractGuard(gym.Wrapper):
         except Exception as error:
             if not self.in_worker:
                 raise
-            _log.warning("close() raised %s.", "".join(_described(error)))
+            _log.warning("close() raised %s: %s", *_described(error))
 
-    def _check_step(self, result: Any, action: Any) -> None:
-        last_action = f"; last action {np.asarray(action)}"
+    def _check_step(self, result: Any) -> None:
         if not isinstance(result, tuple) or len(result) != 5:
-            raise BrokenContractError(
-                "step() must return observation, reward, terminated, truncated, info" + last_action
+            raise self._broken(
+                "step() must return observation, reward, terminated, truncated, info"
             )
         observation, reward, terminated, truncated, info = result
-        self._check_observation(observation, last_action)
+        self._check_observation(observation)
         if type(reward) is not float and not _is_scalar(reward, "biuf"):
-            raise BrokenContractError(f"the reward is {reward!r} and no number{last_action}")
+            raise self._broken(f"the reward is {reward!r} and no number")
         for name, flag in (("terminated", terminated), ("truncated", truncated)):
             if type(flag) is not bool and not _is_scalar(flag, "b"):
-                raise BrokenContractError(f"{name} is {flag!r} and not True or False{last_action}")
+                raise self._broken(f"{name} is {flag!r} and not True or False")
         if not isinstance(info, dict):
-            raise BrokenContractError(f"the info is {info!r} and no dictionary{last_action}")
+            raise self._broken(f"the info is {info!r} and no dictionary")
         if self._n_steps == 0:
             self._tell_missing_success(info)
         self._n_steps += 1
 
-    def _check_observation(self, observation: Any, last_action: str) -> None:
+    def _check_observation(self, observation: Any) -> None:
         if not self._is_dict:
-            self._check_entry("", observation, last_action)
+            self._check_entry("", observation)
             return
         if not isinstance(observation, dict):
-            raise BrokenContractError(
+            raise self._broken(
                 f"the observation is of type {type(observation).__name__} and no dictionary"
-                f"{last_action}"
             )
         for key in self._spaces:
             if key not in observation:
                 given = [str(name) for name in observation]
-                raise BrokenContractError(
+                raise self._broken(
                     f"the observation has no '{key}', which its space has."
-                    f"{did_you_mean(key, given)}{last_action}"
+                    f"{did_you_mean(key, given)}"
                 )
-            self._check_entry(key, observation[key], last_action)
+            self._check_entry(key, observation[key])
 
-    def _check_entry(self, key: str, value: Any, last_action: str) -> None:
+    def _check_entry(self, key: str, value: Any) -> None:
         space = self._spaces[key]
-        name = f"observation '{key}'" if key else "the observation"
         shape, dtype = np.shape(value), getattr(value, "dtype", None)
         if shape != space.shape:
-            raise BrokenContractError(
-                f"{name} has shape {shape}, but its space has {space.shape}{last_action}"
-            )
+            raise self._broken(f"{_name(key)} has shape {shape}, but its space has {space.shape}")
         if dtype is None or dtype != self._accepted_types.get(key):
             dtype = np.asarray(value).dtype
             if space.dtype is not None and not np.can_cast(dtype, space.dtype, "same_kind"):
-                raise BrokenContractError(
-                    f"{name} is of type {dtype}, but its space of {space.dtype}{last_action}"
+                raise self._broken(
+                    f"{_name(key)} is of type {dtype}, but its space of {space.dtype}"
                 )
             self._accepted_types[key] = dtype
         if self._n_steps < _N_BOUNDED_STEPS and self._tells_bounds:
-            self._compare_with_bounds(name, value, space)
+            self._compare_with_bounds(_name(key), value, space)
+
+    def _broken(self, what: str) -> BrokenContractError:
+        acted = "" if self._action is None else f"; last action {np.asarray(self._action)}"
+        return BrokenContractError(what + acted)
 
     def _compare_with_bounds(self, name: str, value: Any, space: spaces.Space) -> None:
         if isinstance(space, spaces.Box):
@@ -149,17 +151,17 @@ class ContractGuard(gym.Wrapper):
                 self._tells_bounds = False
                 _log.warning(
                     "%s: %s is %s at index %s, outside of its space's bounds [%s, %s].",
-                    self._name, name, np.asarray(value)[index], index, space.low[index],
+                    self._env_name, name, np.asarray(value)[index], index, space.low[index],
                     space.high[index],
                 )  # fmt: skip
         elif isinstance(space, spaces.Discrete) and not space.contains(np.int64(value)):
-            raise BrokenContractError(f"{name} is {value}, outside of its space {space}")
+            raise self._broken(f"{name} is {value}, outside of its space {space}")
 
     def _tell_missing_success(self, info: dict[str, Any]) -> None:
         if "desired_goal" in self._spaces and success_of(info) is None:
             _log.warning(
                 "%s has goals, but its infos have no 'is_success': there will be no success rate.",
-                self._name,
+                self._env_name,
             )
 
     def _without_nan(
@@ -172,12 +174,16 @@ class ContractGuard(gym.Wrapper):
         return self._last, 0.0, False, True, {**info, UNSTABLE_KEY: True}
 
     @property
-    def _name(self) -> str:
+    def _env_name(self) -> str:
         return self.spec.id if self.spec else type(self.unwrapped).__name__
 
     def _any_observation(self) -> Any:
         """Return something that can be sent; nobody will look at it."""
         return self.observation_space.sample()
+
+
+def _name(key: str) -> str:
+    return f"observation '{key}'" if key else "the observation"
 
 
 def _described(error: Exception) -> tuple[str, str]:
