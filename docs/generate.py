@@ -71,7 +71,10 @@ def keys_page() -> Iterator[str]:
     main = OmegaConf.load(SHIPPED_CONF / "main.yaml")
     for heading, names in help._headings().items():
         rows = [
-            (f"`{key.name}`", f"{key.meaning}: `{as_typed(main[key.name])}` ({_allowed(key)})")
+            (
+                f"`{key.name}`",
+                f"{_literal(key.meaning)}: `{as_typed(main[key.name])}` ({_allowed(key)})",
+            )
             for key in config.KEYS
             if key.name in names
         ]
@@ -272,6 +275,11 @@ def help_of(command: str | None = None) -> str:
     finally:
         os.environ.pop("COLUMNS") if width is None else os.environ.update(COLUMNS=width)
     return printed.getvalue()
+
+
+def _literal(text: str) -> str:
+    """Return the text with words such as ``_target_`` as code, which Markdown would slant."""
+    return re.sub(r"\b_\w+_\b", r"`\g<0>`", text)
 
 
 def _allowed(key: config.Key) -> str:

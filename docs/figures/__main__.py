@@ -39,7 +39,7 @@ TRAINING = (
     "algorithm.gamma=0.95", "algorithm.tau=0.05", "algorithm.batch_size=128",
     "algorithm.net_arch=[64,64]", "algorithm.buffer_size=10000", "algorithm.learning_starts=200",
 )  # fmt: skip
-N_SEEDS = 5
+N_SEEDS = 4
 
 
 def figure_gamma() -> None:

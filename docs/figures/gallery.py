@@ -54,7 +54,12 @@ def trained(name: str, env: str, metrics: str, *words: str) -> Film:
     return Film(f"algorithm_{name}", (*TRAINED, f"algorithm={name}", f"env={env}", *words), metrics)
 
 
-SHORT = ("n_epochs=3", "eval_after_n_steps=300", "algorithm.learning_rate=1e-3")
+SHORT = (
+    "n_epochs=2", "eval_after_n_steps=250", "tuned=false", "algorithm.learning_rate=1e-3",
+    "algorithm.gamma=0.95", "algorithm.batch_size=64",
+)  # fmt: skip
+SMALL = (*SHORT, "algorithm.net_arch=[64,64]")
+SMALL_SB3 = (*SHORT, "algorithm.policy_kwargs.net_arch=[64,64]")
 REACH = "Reach1DOF-v0"
 Q = "q_values,critic_variance,goal_distance,reward"
 FILMED = (
@@ -72,17 +77,17 @@ FILMED = (
     by_chance("walkers", "HalfCheetah-v5", NO_GOALS),
     by_chance("box2d", "LunarLander-v3", NO_GOALS),
     by_chance("classic", "CartPole-v1", NO_GOALS),
-    trained("sac", REACH, Q, *SHORT),
-    trained("td3", REACH, Q, *SHORT),
-    trained("cleansac", REACH, Q, *SHORT),
-    trained("jaxsac", REACH, Q, *SHORT),
-    trained("sac_var", REACH, Q, *SHORT),
-    trained("cleansacmc", REACH, "q_value,intrinsic_reward,goal_distance", *SHORT),
+    trained("sac", REACH, Q, *SMALL_SB3),
+    trained("td3", REACH, Q, *SMALL_SB3),
+    trained("cleansac", REACH, Q, *SMALL),
+    trained("jaxsac", REACH, Q, *SMALL),
+    trained("sac_var", REACH, Q, *SMALL),
+    trained("cleansacmc", REACH, "q_value,intrinsic_reward,goal_distance", *SMALL),
     trained("actor_critic", REACH, "q_value,goal_distance,reward", *SHORT),
-    trained("dqn", "CartPole-v1", "q_value,td_error,action", "n_epochs=3",
-            "eval_after_n_steps=4000"),
-    trained("cleanppo", "CartPole-v1", "value,entropy,action", "n_epochs=3",
-            "eval_after_n_steps=6000", "n_envs=4"),
+    trained("dqn", "CartPole-v1", "q_value,td_error,action", "n_epochs=2",
+            "eval_after_n_steps=2000"),
+    trained("cleanppo", "CartPole-v1", "value,entropy,action", "n_epochs=2",
+            "eval_after_n_steps=4000", "n_envs=4"),
 )  # fmt: skip
 
 
