@@ -36,7 +36,7 @@ class Mirror(Tracker):
         *,
         queue_size: int = 10_000,
         max_failures: int = 3,
-        patience_seconds: float = 20.0,
+        patience_seconds: float = 60.0,
     ) -> None:
         self.tracker = tracker
         self.label = label
