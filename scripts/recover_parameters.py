@@ -26,7 +26,7 @@ TRAINING = (
     "algorithm=cleandqn", "env=scilab_rl.testing:TinyDiscrete-v0", "seed=1", "n_epochs=4",
     "eval_after_n_steps=1000", "n_test_rollouts=20", "mlflow=0", "algorithm.learning_rate=1e-3",
     "algorithm.target_update_interval=200", "algorithm.exploration_fraction=0.5",
-    "algorithm.replay_buffer_class=null", "algorithm.buffer_size=5000",
+    "algorithm.gamma=0.8", "algorithm.replay_buffer_class=null", "algorithm.buffer_size=5000",
 )  # fmt: skip
 KNOWN = (1.0, 3.0, 8.0)
 
@@ -80,8 +80,9 @@ def main() -> None:
     for number, beta in enumerate(KNOWN):
         table = options.folder / f"participant_{number}.csv"
         scilab_rl(
-            "export", "last", "--trials", f"--softmax={beta}", f"--episodes={options.episodes}",
-            f"--seed={number + 1}", f"--output={table}", f"--base-logdir={options.folder}",
+            "export", "last", "--trials", "--policy=best", f"--softmax={beta}",
+            f"--episodes={options.episodes}", f"--seed={number + 1}", f"--output={table}",
+            f"--base-logdir={options.folder}",
         )  # fmt: skip
         actions, values = read_trials(table)
         estimate, error = fit_inverse_temperature(actions, values)

@@ -20,6 +20,7 @@ from scilab_rl.performance.estimates import (
     permutation_test,
     probability_of_improvement,
     seeds_needed,
+    smallest_p,
 )
 from scilab_rl.performance.groups import FAILED, UNFINISHED, Group, RunRecord
 from scilab_rl.provenance import fingerprint_differences
@@ -223,8 +224,9 @@ def _at(curve: Curve, steps: np.ndarray) -> np.ndarray:
 
 def _contrasts(sides: Sequence[Side], settings: Settings) -> tuple[Contrast, ...]:
     first, raw = sides[0], []
+    level = _SIGNIFICANT / (len(sides) - 1)
     for side in sides[1:]:
-        ours, theirs, paired = _paired(first, side)
+        ours, theirs, paired = _paired(first, side, level)
         raw.append((side, ours, theirs, paired, permutation_test(ours, theirs, paired=paired)))
     corrected = holm([entry[4] for entry in raw])
     sign = -1 if settings.score == "steps_to_threshold" else 1
@@ -236,7 +238,10 @@ def _contrasts(sides: Sequence[Side], settings: Settings) -> tuple[Contrast, ...
         better = mean.value * sign > 0
         spread = np.ptp(np.concatenate([*ours, *theirs]))
         smallest = _SMALLEST_EFFECT * (float(spread) or 1.0)
-        needed = seeds_needed(ours, theirs, paired=paired, at_least=smallest)
+        needed = min(
+            seeds_needed(ours, theirs, paired=as_pairs, at_least=smallest, level=level)
+            for as_pairs in {paired, False}
+        )
         contrasts.append(
             Contrast(
                 side.label, paired, n,
@@ -268,10 +273,13 @@ def _improvement(ours: Sequence[np.ndarray], theirs: Sequence[np.ndarray], sign:
     return probability_of_improvement([sign * x for x in ours], [sign * x for x in theirs])
 
 
-def _paired(first: Side, other: Side) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray], bool]:
+def _paired(
+    first: Side, other: Side, level: float
+) -> tuple[Sequence[np.ndarray], Sequence[np.ndarray], bool]:
     """Return the scores of both sides, those of common seeds side by side if all tasks have any.
 
-    Pairs are used when they leave out at most half of the runs.
+    Pairs are used when they leave out at most half of the runs and are enough to decide anything:
+    five pairs cannot give a p below 0.06, five runs against five can.
     """
     ours, theirs = [], []
     for task, (left, right) in enumerate(zip(first.seeds, other.seeds, strict=True)):
@@ -280,6 +288,9 @@ def _paired(first: Side, other: Side) -> tuple[Sequence[np.ndarray], Sequence[np
             return first.scores, other.scores, False
         ours.append(first.scores[task][[left.index(seed) for seed in common]])
         theirs.append(other.scores[task][[right.index(seed) for seed in common]])
+    n_pairs = sum(map(len, ours))
+    if smallest_p(n_pairs, n_pairs, paired=True) > level:
+        return first.scores, other.scores, False
     return ours, theirs, True
 
 

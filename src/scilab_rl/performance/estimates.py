@@ -12,13 +12,14 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from statistics import NormalDist
 
 import numpy as np
 
 Scores = Sequence[np.ndarray]  # one array of runs per task
 N_SAMPLES = 5000
 _MOST_EXACT = 20_000  # assignments that are still listed completely
-_Z_TWO_SIDED, _Z_POWER = 1.959964, 0.841621  # 95 % and 80 %
+_POWER = 0.8
 
 
 @dataclass(frozen=True)
@@ -166,7 +167,9 @@ def smallest_p(n_ours: int, n_theirs: int, *, paired: bool) -> float:
     return 2 / (2**n_ours if paired else math.comb(n_ours + n_theirs, n_ours))
 
 
-def seeds_needed(ours: Scores, theirs: Scores, *, paired: bool, at_least: float) -> int:
+def seeds_needed(
+    ours: Scores, theirs: Scores, *, paired: bool, at_least: float, level: float = 0.05
+) -> int:
     """Return how many runs of each side in all would decide with 80 % power.
 
     Args:
@@ -174,6 +177,7 @@ def seeds_needed(ours: Scores, theirs: Scores, *, paired: bool, at_least: float)
         theirs: The same for the other side.
         paired: Whether runs at the same place have the same seed.
         at_least: A smaller difference than this is not looked for.
+        level: The p value that decides; smaller when there are several comparisons.
     """
     gaps = [float(b.mean() - a.mean()) for a, b in zip(ours, theirs, strict=True)]
     effect = max(abs(math.fsum(gaps) / len(gaps)), at_least)
@@ -181,9 +185,12 @@ def seeds_needed(ours: Scores, theirs: Scores, *, paired: bool, at_least: float)
         variance = np.mean([_variance(b - a) for a, b in zip(ours, theirs, strict=True)])
     else:
         variance = np.mean([_variance(a) + _variance(b) for a, b in zip(ours, theirs, strict=True)])
-    wanted = (_Z_TWO_SIDED + _Z_POWER) ** 2 * float(variance) / effect**2 / len(gaps)
+    quantile = NormalDist().inv_cdf
+    wanted = (
+        (quantile(1 - level / 2) + quantile(_POWER)) ** 2 * float(variance) / effect**2 / len(gaps)
+    )
     n = max(2, math.ceil(wanted))
-    while smallest_p(n, n, paired=paired) > 0.05:
+    while smallest_p(n, n, paired=paired) > level:
         n += 1
     return n
 

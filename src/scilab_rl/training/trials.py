@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_normalize
 from scilab_rl.algorithms.inspection import Q_VALUES, Inspection
 from scilab_rl.errors import ConfigError
 from scilab_rl.metrics.probes import EpisodeProbes, answerable, built_in
+from scilab_rl.seeding import derive_seed
 
 _log = logging.getLogger(__name__)
 # Probe -> column.
@@ -129,7 +130,8 @@ def softmax_choice(model: Any, inverse_temperature: float, seed: int) -> Choose:
             f"--softmax needs an algorithm with values of discrete actions, such as cleandqn, and "
             f"not {type(model).__name__} with {space}."
         )
-    rng = np.random.default_rng(seed)
+    # Not the very numbers that the environment draws from the same seed.
+    rng = np.random.default_rng(derive_seed(seed, "choices"))
 
     def choose(observation: Any) -> Any:
         with mind.undisturbed():

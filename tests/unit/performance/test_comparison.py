@@ -70,8 +70,16 @@ def test_too_few_seeds_decide_nothing_and_it_is_said_how_many_would(tmp_path: Pa
     comparison = compare(sides(tmp_path, "sac", "td3"), Settings())
     (contrast,) = comparison.contrasts
     assert contrast.verdict == "undecided"
-    assert contrast.more_seeds == 3  # six pairs can reach p = 1/32
-    assert "about 3 more seeds of each would decide" in conclusion(comparison, contrast)
+    assert not contrast.paired
+    assert contrast.more_seeds == 1  # four against four can reach p = 2/70, three pairs 1/4
+    assert "about 1 more seeds of each would decide" in conclusion(comparison, contrast)
+
+
+def test_five_seeds_decide_without_pairs(tmp_path: Path) -> None:
+    make_two(tmp_path, n=5)
+    (contrast,) = compare(sides(tmp_path, "sac", "td3"), Settings()).contrasts
+    assert (contrast.paired, contrast.verdict) == (False, "better")
+    assert contrast.p == pytest.approx(2 / 252)
 
 
 def test_scores_by_hand(tmp_path: Path) -> None:

@@ -98,6 +98,8 @@ def test_how_many_seeds_would_decide() -> None:
     assert seeds_needed([LOW], [HIGH], paired=False, at_least=0.01) == 4
     assert smallest_p(3, 3, paired=False) == 0.1
     assert seeds_needed([LOW], [HIGH], paired=True, at_least=0.01) == 6
+    # Four comparisons need p = 0.0125 each: 2 / 2 ** 8 = 0.0078 is below it, 2 / 2 ** 7 is not.
+    assert seeds_needed([LOW], [HIGH], paired=True, at_least=0.01, level=0.0125) == 8
     noisy = np.array([0.0, 1.0, 0.0, 1.0])
     # s^2 = 1/3 on both sides, d = 0.25: 7.85 * (2/3) / 0.0625 = 83.7
     assert seeds_needed([noisy], [noisy + 0.25], paired=False, at_least=0.01) == 84
