@@ -33,13 +33,15 @@ SHORT = {
 # Looks at what `view` serves, and ends it as a user does.
 LOOK = """
 import re, signal, subprocess, sys, urllib.request
-view = subprocess.Popen(sys.argv[1:], stderr=subprocess.PIPE, text=True)
+# Where tests run in the background, Ctrl-C is ignored unless one asks for it.
+restore = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
+view = subprocess.Popen(sys.argv[1:], stderr=subprocess.PIPE, text=True, preexec_fn=restore)
 for line in view.stderr:
     if found := re.search(r"Open (http://\\S+)", line):
         page = urllib.request.urlopen(found[1], timeout=20).read().decode()
         assert "critic_variance" in page
         view.send_signal(signal.SIGINT)
-view.wait(30)
+sys.exit(view.wait(30) not in (0, 130))
 """
 pytestmark = pytest.mark.slow
 
