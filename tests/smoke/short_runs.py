@@ -10,12 +10,13 @@ from typing import Any
 import gymnasium as gym
 import hydra
 import pytest
+from gymnasium.envs.registration import load_env_creator
 from omegaconf import OmegaConf
 
 from scilab_rl import assembly, config, experiment
 from scilab_rl.algorithms.compatibility import check_pair
 from scilab_rl.envs.ids import FAMILIES
-from scilab_rl.envs.registration import module_of
+from scilab_rl.envs.registration import module_of, resolve_env_id
 from scilab_rl.envs.vectorize import EnvSettings, make_single_env
 from scilab_rl.errors import ConfigError, MissingDependencyError
 from scilab_rl.performance.conditions import performance_tests
@@ -118,6 +119,13 @@ def fitting_algorithm(env_id: str, *overrides: str) -> str:
             env.close()
             return name
     raise AssertionError(f"no algorithm fits {env_id}")
+
+
+def can_draw(env_id: str) -> bool:
+    """Tell whether an environment says that it has frames; those of tests may have none."""
+    target = gym.spec(resolve_env_id(env_id)[0].rpartition(":")[2]).entry_point
+    made = load_env_creator(target) if isinstance(target, str) else target
+    return "rgb_array" in getattr(made, "metadata", {"render_modes": ["rgb_array"]})["render_modes"]
 
 
 def fitting_environment(algorithm: str) -> str:
