@@ -99,7 +99,7 @@ def test_story(tmp_path: Path) -> None:
     assert "95 % interval" in printed[0]
     assert list((desk / "data").glob("*/*FetchReach*/episodes/play_001.mp4"))
     assert len(list((desk / "data").glob("*/*Reach1DOF*my_sac*"))) >= 3
-    assert "my_sac" in printed[-1] and "cleansac" in printed[-1]
+    assert "my_study" in printed[-1] and "cleansac" in printed[-1]
 
 
 def clone(folder: Path) -> Path:
