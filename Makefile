@@ -24,8 +24,8 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
 
-demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 5 minutes)
-	$(BIN)/python src/main.py algorithm=sac env=FetchReach-v4 seed=1 $(DEMO)
+demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 2 minutes)
+	$(BIN)/python src/main.py algorithm=jaxsac env=FetchReach-v4 seed=1 $(DEMO)
 	$(BIN)/python src/main.py play last --episodes 20 --record
 
 check: $(VENV)/.installed  ## format, lint, types and import layers, as CI runs them
