@@ -147,14 +147,12 @@ class _Capture:
             return value
         if isinstance(value, np.generic):
             return value.item()
-        if isinstance(value, torch.Tensor):
+        if isinstance(value, torch.Tensor) or _is_jax_array(value):
             return self._tensor(value, path)
         if isinstance(value, np.ndarray):
             return self._array(value, path, rows)
         if isinstance(value, (dict, list, tuple, deque)):
             return self._container(value, path, rows)
-        if _is_jax_array(value):
-            return self._tensor(torch.from_numpy(np.array(value)), path) | {"@kind": "jax"}
         if isinstance(value, _CLOSED) or id(value) in self.seen:
             return {"@kind": "skip"}
         self.seen.add(id(value))
@@ -182,7 +180,10 @@ class _Capture:
             (BaseBuffer, self._buffer),
         ]
 
-    def _tensor(self, value: torch.Tensor, path: str) -> Node:
+    def _tensor(self, value: Any, path: str) -> Node:
+        if not isinstance(value, torch.Tensor):  # of JAX
+            self.snapshot.tensors[path] = torch.from_numpy(np.array(value))
+            return {"@kind": "jax", "name": path}
         self.snapshot.tensors[path] = value.detach()
         return {"@kind": "tensor", "name": path}
 
