@@ -299,23 +299,6 @@ def test_f19_score_that_is_no_number_never_wins(value: str, tmp_path: Path) -> N
     assert not study.ledger.trials(TrialState.COMPLETE)
 
 
-@pytest.mark.slow
-def test_workers_are_busy_with_runs_of_unequal_length(tmp_path: Path) -> None:
-    """Runs whose lengths differ by 1:5: no barrier, so the workers hardly ever wait."""
-    space = toy.SearchSpace([
-        toy.Parameter("++x", "categorical", choices=(0.1, 0.2)),
-        toy.Parameter("++seconds", "categorical", choices=(1.5, 3.0, 4.5, 6.0, 7.5)),
-    ])  # fmt: skip
-    study = toy.run(
-        tmp_path / "study", space=space, max_trials=20, max_trials_per_param=2, pruner="none",
-        n_final_runs=0,
-    )  # fmt: skip
-    # From the first end of a run, when both workers have started, to the start of the last run.
-    first, last = min(map(ended, study.runs)), max(run.started for run in study.runs)
-    busy = sum(max(0.0, min(ended(r), last) - max(r.started, first)) for r in study.runs)
-    assert busy / (2 * (last - first)) >= 0.95
-
-
 def ended_or_progressed(process: subprocess.Popen, directory: Path, count: int) -> bool:
     """Wait until a study has finished, or until it has done some more runs."""
 
@@ -330,10 +313,6 @@ def ended_or_progressed(process: subprocess.Popen, directory: Path, count: int) 
     output, errors = process.communicate()
     assert output == "finished\n", errors
     return True
-
-
-def ended(run) -> float:
-    return run.started + run.seconds
 
 
 def settings_and_scores(study) -> list[tuple]:
