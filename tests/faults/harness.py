@@ -101,6 +101,8 @@ class Process:
     def __post_init__(self) -> None:
         self._started = time.monotonic()
         self._files = [self.cwd / f".{id(self)}.{name}" for name in ("out", "err")]
+        for path in self._files:  # it may be killed before it has written anything
+            path.touch(0o600)
         self._process = _server.Process(target=_main, args=(self.__dict__.copy(),))
         self._process.start()
 

@@ -299,7 +299,8 @@ def test_f32_archives_are_never_unpacked(
     )
     assert code in (1, 2)
     assert "Traceback" not in capsys.readouterr().err
-    assert not list(desk.parent.rglob("outside*"))
+    assert not list(desk.rglob("outside*"))
+    assert not list(desk.parent.glob("outside*"))
     assert not Path("/tmp/outside-of-all").exists()
 
 

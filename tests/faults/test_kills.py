@@ -143,7 +143,7 @@ def killed_again_and_again(algorithm: str, uninterrupted, folder: Path, n_kills:
     steps = []
     for _ in range(n_kills):
         wait_until(lambda: list(folder.glob("data/*/*/checkpoints/last/manifest.json")))
-        deadline = time.monotonic() + rng.uniform(0.0, 1.0)
+        deadline = time.monotonic() + rng.uniform(0.0, 0.3)
         while process.is_running() and time.monotonic() < deadline:
             time.sleep(0.002)
         if process.is_running():
@@ -153,7 +153,8 @@ def killed_again_and_again(algorithm: str, uninterrupted, folder: Path, n_kills:
         (run,) = runs_in(folder)
         steps.append(checkpoint.verify(run / "checkpoints" / "last")["step"])
         process = Process(("resume", str(run)), folder)
-    process.wait()
+    else:
+        process.wait()
     assert steps == sorted(steps)
     (run,) = runs_in(folder)
     if result_of(run)["status"] != "finished":

@@ -139,11 +139,14 @@ class Trainer(BaseCallback):
         steps = self.model.num_timesteps
         if self.stop_request:
             self._stop(steps, resume.take(self.model, self))
-        if self.plan.save_model_freq and steps >= self._next_checkpoint:
+        is_due = self.plan.save_model_freq > 0 and steps >= self._next_checkpoint
+        if is_due:
             self._next_checkpoint += self.plan.save_model_freq
             self._save_checkpoint(steps, resume.take(self.model, self))
-        if self._rollouts_are_long() and time.monotonic() - self._boundary_taken > 1.0:
-            # A long rollout cannot be saved in its middle; a stop then goes back to its beginning.
+        is_old = time.monotonic() - self._boundary_taken > 1.0
+        if self._rollouts_are_long() and (is_due or is_old):
+            # A long rollout cannot be saved in its middle; a stop then goes back to its beginning,
+            # and never behind a checkpoint.
             self._boundary = steps, resume.frozen(resume.take(self.model, self))
             self._boundary_taken = time.monotonic()
 
