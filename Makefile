@@ -24,7 +24,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
 
-demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about 2 minutes)
+demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about a minute)
 	$(BIN)/python src/main.py algorithm=jaxsac env=FetchReach-v4 seed=1 $(DEMO)
 	$(BIN)/python src/main.py play last --episodes 20 --record
 
