@@ -119,7 +119,9 @@ def test_f06_folder_that_cannot_be(base: str, reason: str, tmp_path: Path) -> No
 def test_f06_folder_that_vanishes_meanwhile(tmp_path: Path) -> None:
     process = Process((*RANDOM, "n_epochs=100000"), tmp_path)
     wait_until(lambda: list(tmp_path.glob("data/*/*/metrics.csv")))
-    shutil.rmtree(tmp_path / "data")
+    # In one stroke: a folder that is emptied file by file gets new ones meanwhile.
+    (tmp_path / "data").rename(tmp_path / "elsewhere")
+    shutil.rmtree(tmp_path / "elsewhere", ignore_errors=True)
     done = process.wait(60)
     assert done.code == 1
     assert "cannot be written: No such file or directory" in done.error

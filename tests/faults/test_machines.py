@@ -166,10 +166,12 @@ def test_f40_full_output(folder: Path) -> None:
 
 @pytest.mark.parametrize("columns", ["20", "100"])
 def test_f40_on_a_terminal(columns: str, folder: Path) -> None:
+    terminal = os.environ | {"TERM": "xterm", "COLUMNS": columns, "LINES": "24"}
+    terminal.pop("CI", None)  # there, even a terminal gets plain lines
     leader, follower = pty.openpty()
     process = subprocess.Popen(
         command("runs"), cwd=folder, stdin=follower, stdout=follower, stderr=follower,
-        env=os.environ | {"TERM": "xterm", "COLUMNS": columns, "LINES": "24"},
+        env=terminal,
     )  # fmt: skip
     os.close(follower)
     shown = b""
