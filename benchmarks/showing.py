@@ -42,7 +42,7 @@ FOUR = "render_metrics_test=[q_value,critic_variance,goal_distance,reward]"
 FOUR_TRAIN = "render_metrics_train=[q_value,critic_variance,goal_distance,reward]"
 REPEATS = 3
 EPISODE = 50  # steps of an episode of Fetch
-N_PAIRS = 12  # of windows, per viewer
+N_PAIRS = 48  # of windows, per viewer
 
 
 def main() -> None:

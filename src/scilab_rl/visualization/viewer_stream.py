@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from scilab_rl.errors import MissingDependencyError
 from scilab_rl.visualization.panels import COLOURS, grid
@@ -41,6 +43,18 @@ def import_rerun(purpose: str) -> Any:
     return rerun
 
 
+class _Row(NamedTuple):
+    """What is written at one step of the viewer; without content, a gap."""
+
+    step: int
+    total_steps: int
+    seconds: float
+    picture: bytes = b""
+    values: Mapping[str, float] = MappingProxyType({})
+    events: Sequence[str] = ()
+    place: str = ""
+
+
 class ViewerStream:
     """Writes records to a recording of the viewer.
 
@@ -65,49 +79,72 @@ class ViewerStream:
         self._info = info
         self._curves |= {panel: [] for panel in info.panels if panel not in self._curves}
 
-    def add(self, record: Record, seconds: float | None = None) -> None:
-        """Write a scene.
+    def add(self, records: Sequence[Record], seconds: Sequence[float]) -> None:
+        """Write scenes; several at once cost little more than one.
 
         Args:
-            record: The scene; without a picture, its numbers.
-            seconds: When it was, since 1970; None: now.
+            records: The scenes; of one without a picture, its numbers.
+            seconds: When each was, since 1970.
         """
-        seconds = time.time() if seconds is None else seconds
-        if record.step == 0 and self._n_scenes:
-            self._leave_gap(record, seconds)
-        self._set_times(record, seconds)
-        if record.picture:
-            picture = self.rerun.EncodedImage(
-                contents=record.picture, media_type=media_type(record.picture)
+        rows = list(self._rows(records, seconds))
+        self._send_values(rows)
+        scenes = [row for row in rows if row.place]
+        places = [f"{self._about()}: {row.place}" for row in scenes]
+        times = self._times(scenes)
+        self.recording.send_columns("about", times, self.rerun.TextDocument.columns(text=places))
+        pictures = [row for row in scenes if row.picture]
+        if pictures:
+            columns = self.rerun.EncodedImage.columns(
+                blob=[row.picture for row in pictures],
+                media_type=[media_type(row.picture) for row in pictures],
             )
-            self.recording.log("scene", picture)
-        self._log_values(record.values)
-        self.recording.log("about", self.rerun.TextDocument(self._about(record)))
-        for event in record.events:
-            self.recording.log("events", self.rerun.TextLog(f"{self._place(record)}: {event}"))
+            all_have_one = len(pictures) == len(scenes)
+            self.recording.send_columns(
+                "scene", times if all_have_one else self._times(pictures), columns
+            )
+        events = [(row, event) for row in scenes for event in row.events]
+        if events:
+            texts = [f"{row.place}: {event}" for row, event in events]
+            times = self._times([row for row, _ in events])
+            self.recording.send_columns("events", times, self.rerun.TextLog.columns(text=texts))
+
+    def _rows(self, records: Sequence[Record], seconds: Sequence[float]) -> Iterator[_Row]:
+        """Yield the rows of scenes, with an empty one between two episodes."""
+        for record, when in zip(records, seconds, strict=True):
+            if record.step == 0 and self._n_scenes:
+                yield self._row(record.total_steps, when)
+            place = self._place(record)
+            yield self._row(
+                record.total_steps, when, record.picture, record.values, record.events, place
+            )
+
+    def _row(self, total_steps: int, seconds: float, *content: Any) -> _Row:
         self._n_scenes += 1
+        return _Row(self._n_scenes - 1, total_steps, seconds, *content)
 
-    def _set_times(self, record: Record, seconds: float) -> None:
-        self.recording.set_time("step", sequence=self._n_scenes)
-        self.recording.set_time("environment step", sequence=record.total_steps)
-        self.recording.set_time("time", timestamp=seconds)
+    def _times(self, rows: Sequence[_Row]) -> list[Any]:
+        column = self.rerun.TimeColumn
+        nanoseconds = np.array([row.seconds for row in rows]) * 1e9
+        return [
+            column("step", sequence=[row.step for row in rows]),
+            column("environment step", sequence=[row.total_steps for row in rows]),
+            column("time", timestamp=nanoseconds.astype("datetime64[ns]")),
+        ]
 
-    def _leave_gap(self, record: Record, seconds: float) -> None:
-        """Separate the curves of two episodes by a step without numbers."""
-        self._set_times(record, seconds)
-        self._log_values({})
-        self._n_scenes += 1
-
-    def _log_values(self, numbers: dict[str, float]) -> None:
-        for curve in numbers:
+    def _send_values(self, rows: Sequence[_Row]) -> None:
+        for curve in dict.fromkeys(name for row in rows for name in row.values):
             known = self._curves.setdefault(panel_of(curve), [])
             if curve not in known:
                 known.append(curve)
+        times = self._times(rows)
         for panel, curves in self._curves.items():
             if self._styled.get(panel) != len(curves):
                 self._style(panel, curves)
-            values = [numbers.get(curve, _GAP) for curve in curves]
-            self.recording.log(["metrics", panel], self.rerun.Scalars(values or [_GAP]))
+            names = curves or [panel]  # what nobody has recorded yet is a gap
+            numbers = [row.values.get(name, _GAP) for row in rows for name in names]
+            columns = self.rerun.Scalars.columns(scalars=numbers)
+            entity = self.rerun.new_entity_path(["metrics", panel])
+            self.recording.send_columns(entity, times, columns.partition([len(names)] * len(rows)))
 
     def _style(self, panel: str, curves: list[str]) -> None:
         self._styled[panel] = len(curves)
@@ -117,9 +154,9 @@ class ViewerStream:
             lines = self.rerun.SeriesLines(colors=colours, names=names, widths=[1.8] * len(curves))
             self.recording.log(["metrics", panel], lines, static=True)
 
-    def _about(self, record: Record) -> str:
+    def _about(self) -> str:
         assert self._info is not None
-        return f"{self._info.env_id} {self._info.algorithm}: {self._place(record)}"
+        return f"{self._info.env_id} {self._info.algorithm}"
 
     def _place(self, record: Record) -> str:
         assert self._info is not None
@@ -165,8 +202,7 @@ def write_viewer_file(clip: Clip, path: Path) -> None:
     recording.set_sinks(rerun.FileSink(str(path)), default_blueprint=layout(clip.info.panels))
     stream = ViewerStream(recording)
     stream.begin(clip.info)
-    for index, record in enumerate(clip.records):
-        stream.add(record, seconds=index / clip.info.fps)
+    stream.add(clip.records, [index / clip.info.fps for index in range(len(clip.records))])
     recording.flush(timeout_sec=_PATIENCE)
     recording.disconnect()
 

@@ -7,7 +7,7 @@ import signal
 import socket
 import time
 import urllib.request
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import psutil
 import pytest
@@ -93,10 +93,10 @@ def test_pictures_are_dropped_and_numbers_never(
     written: list[Record] = []
     hanging = True
 
-    def slow_add(self: object, record: Record) -> None:
+    def slow_add(self: object, records: Sequence[Record], seconds: Sequence[float]) -> None:
         while hanging:
             time.sleep(0.01)
-        written.append(record)
+        written.extend(records)
 
     monkeypatch.setattr("scilab_rl.visualization.viewer_stream.ViewerStream.add", slow_add)
     show(viewer, 40)
