@@ -5,11 +5,13 @@ BIN    := $(VENV)/bin
 EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim,jax,docs
 # Two cores learn as fast as one on small networks, but two test workers halve the waiting.
 WORKERS ?= 2
+# Which benchmarks `make bench` runs; empty: all up to an hour each.
+BENCH ?=
 # Further settings of `make demo`, such as DEMO=n_epochs=1.
 DEMO ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help setup check format test test-slow smoke performance test-myosuite demo docs docs-figures gallery figure-fetchpush mlflow audit clean-venv
+.PHONY: help setup check format test test-slow smoke performance test-myosuite bench demo docs docs-figures gallery figure-fetchpush mlflow audit clean-venv
 
 help:  ## list the targets
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
@@ -23,6 +25,16 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
+
+.venv-peers/.installed: benchmarks/peers/requirements.txt
+	$(PYTHON) -m venv .venv-peers
+	.venv-peers/bin/pip install --quiet -r benchmarks/peers/requirements.txt
+	# Its script runs with newer versions than it asks for, see benchmarks/peers/cleanrl_sac.py.
+	.venv-peers/bin/pip install --quiet --no-deps --ignore-requires-python cleanrl==1.2.0
+	@touch $@
+
+bench: $(VENV)/.installed .venv-peers/.installed  ## all benchmarks (two hours; BENCH="startup updates": only these)
+	$(BIN)/python benchmarks/all.py $(BENCH)
 
 demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about a minute)
 	$(BIN)/python src/main.py algorithm=jaxsac env=FetchReach-v4 seed=1 $(DEMO)

@@ -1,6 +1,6 @@
 """Time and memory of a checkpoint with a full replay buffer of 1M FetchPush transitions.
 
-Run: python benchmarks/checkpoint_1m.py [--transitions N]
+Run: python benchmarks/checkpoint_1m.py [--transitions N] [--json FILE]
 """
 
 from __future__ import annotations
@@ -25,7 +25,9 @@ def main() -> None:
     """Measure and print one JSON object."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--transitions", type=int, default=1_000_000)
-    n = parser.parse_args().transitions
+    parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
+    arguments = parser.parse_args()
+    n = arguments.transitions
     process = psutil.Process()
     model = make_model(n)
     for array in arrays_of(model.replay_buffer):
@@ -46,7 +48,10 @@ def main() -> None:
         "bytes_per_transition": round(size / n),
         "memory_growth_while_saving_mib": round((peak - before) / 2**20, 1),
     }
-    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    text = json.dumps(result, indent=2) + "\n"
+    sys.stdout.write(text)
+    if arguments.json:
+        arguments.json.write_text(text, encoding="utf-8")
 
 
 def make_model(n: int) -> SAC:

@@ -5,7 +5,7 @@ of the blocks counts, in processor time. Ours come with all wrappers of a run, t
 "identical" compares observations, rewards and endings to the last bit over all steps, from the same
 seeds; "-" where ours is a task of its own beside its nearest relative.
 
-Run: python benchmarks/environments.py [--steps N] [--json]
+Run: python benchmarks/environments.py [--steps N] [--json FILE]
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -217,17 +218,19 @@ def main() -> None:
     """Print the table while it is measured, and all as JSON at the end."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--steps", type=int, default=1000, help="for each (default 1000)")
-    parser.add_argument("--json", action="store_true", help="print only JSON")
+    parser.add_argument("--json", type=Path, help="also write the JSON to this file")
     options = parser.parse_args()
-    table = sys.stderr if options.json else sys.stdout
-    table.write(f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}\n")
+    sys.stdout.write(f"| {' | '.join(COLUMNS)} |\n|{' --- |' * len(COLUMNS)}\n")
     rows = []
     for pair in PAIRS:
         if importlib.util.find_spec(pair.package):
             rows.append(measure(pair, options.steps))
-            table.write(as_line(rows[-1]) + "\n")
-            table.flush()
-    sys.stdout.write(json.dumps(rows) + "\n")
+            sys.stdout.write(as_line(rows[-1]) + "\n")
+            sys.stdout.flush()
+    text = json.dumps(rows) + "\n"
+    sys.stdout.write(text)
+    if options.json:
+        options.json.write_text(text, encoding="utf-8")
 
 
 if __name__ == "__main__":

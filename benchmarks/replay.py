@@ -6,6 +6,7 @@ Both hold the same steps of the same episodes. Prints a table and one JSON objec
   ``reward_<n>_ms``: the part of ``compute_reward``, for as many goals as are put in;
 * ``add_ms``: time to store a step of all environments;
 * ``bytes_per_transition``: of its arrays, and of the infos that it keeps (bar: 60 % of the peer's);
+* ``resident_bytes_per_transition``: by how much a process of its own grows while it is filled;
 * ``save_seconds``, ``load_seconds``, ``saved_bytes_per_transition``: of a checkpoint with hashes.
 
 Times are medians, taken in the order A B B A within one run.
@@ -17,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import multiprocessing
 import os
 import statistics
 import sys
@@ -28,6 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import torch
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
@@ -55,6 +58,9 @@ def main() -> None:
     env = make_train_env(EnvSettings("FetchPush-v4", n_envs=N_ENVS))
     buffers = {name: make(cls, env, arguments.transitions) for name, cls in PEERS.items()}
     results: Results = {name: {} for name in PEERS}
+    for name in PEERS:
+        growth = alone(resident_growth, name, arguments.transitions)
+        results[name]["resident_bytes_per_transition"] = growth / arguments.transitions
     fill(buffers, env, arguments.transitions // N_ENVS, results)
     for batch_size in BATCH_SIZES:
         time_sampling(buffers, batch_size, results)
@@ -113,6 +119,26 @@ def fill(buffers: dict[str, Any], env: VecEnv, n_steps: int, results: Results) -
         results[name]["add_ms"] = 1e3 * statistics.median(values)
 
 
+def alone(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a new process."""
+    with multiprocessing.get_context("spawn").Pool(1) as process:
+        return process.apply(function, arguments)
+
+
+def resident_growth(name: str, n_transitions: int) -> int:
+    """Return by how many bytes this process grows while a buffer is made and filled."""
+    torch.set_num_threads(1)
+    env = make_train_env(EnvSettings("FetchPush-v4", n_envs=N_ENVS))
+    for _ in episodes(env, EPISODE):  # what only making the steps takes is not the buffer's
+        pass
+    process = psutil.Process()
+    before = process.memory_info().rss
+    buffer = make(PEERS[name], env, n_transitions)
+    for step in episodes(env, n_transitions // N_ENVS):
+        buffer.add(*step)
+    return process.memory_info().rss - before
+
+
 def time_sampling(buffers: dict[str, Any], batch_size: int, results: Results) -> None:
     """Time blocks of draws in the order A B B A."""
     times: dict[str, list[float]] = {name: [] for name in buffers}
@@ -169,10 +195,10 @@ def timed(function: Callable[[], Any]) -> float:
 
 def table(results: Results, ratios: dict[str, float]) -> str:
     """Return the results side by side."""
-    lines = [f"{'':28}{'ours':>10}{'stable-baselines3':>20}{'ratio':>8}"]
+    lines = [f"{'':32}{'ours':>10}{'stable-baselines3':>20}{'ratio':>8}"]
     for key, ratio in ratios.items():
         ours, theirs = (results[name][key] for name in PEERS)
-        lines.append(f"{key:28}{ours:10.3f}{theirs:20.3f}{ratio:8.2f}")
+        lines.append(f"{key:32}{ours:10.3f}{theirs:20.3f}{ratio:8.2f}")
     return "\n".join(lines)
 
 

@@ -13,11 +13,12 @@ Two studies with real worker processes, a real sampler and a real database:
 
 Prints a table on standard error and JSON on standard output.
 
-Run: python benchmarks/study.py
+Run: python benchmarks/study.py [--json FILE]
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import statistics
@@ -64,6 +65,11 @@ class Clock:
 
 def main() -> None:
     """Measure both studies and print them."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument(
+        "--json", type=lambda name: Path(name).absolute(), help="also write the JSON to this file"
+    )
+    arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
         result = {"unequal": unequal(Path("unequal")), "trainings": trainings(Path("trainings"))}
@@ -74,7 +80,10 @@ def main() -> None:
         ("overhead per run (s)", overhead, f"< {OVERHEAD_BAR}", overhead < OVERHEAD_BAR),
     ):
         sys.stderr.write(f"{name:24}{value:8.3f}   {bar:8} {'met' if met else 'MISSED'}\n")
-    sys.stdout.write(json.dumps(result, indent=2) + "\n")
+    text = json.dumps(result, indent=2) + "\n"
+    sys.stdout.write(text)
+    if arguments.json:
+        arguments.json.write_text(text, encoding="utf-8")
 
 
 def unequal(folder: Path) -> dict[str, Any]:

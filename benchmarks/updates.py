@@ -1,29 +1,36 @@
-"""Updates per second of our algorithms beside Stable-Baselines3's, on the same data.
+"""Updates per second of our algorithms beside those of others, on the same data.
 
 Every algorithm is built as a run would build it, gets the same recorded steps of FetchReach into a
 replay buffer of 1M transitions, and does updates as a run does them: sampling with hindsight,
-gradients, targets, and its own bookkeeping. Single updates of all algorithms take turns, forwards
+gradients, targets, and its own bookkeeping. The others are Stable-Baselines3, sbx, Tianshou, and
+CleanRL, which has no hindsight and only layers of [256, 256]; the last three answer from processes
+in a virtual environment of their own. Single updates of all algorithms take turns, forwards
 and then backwards (A B B A), so that slow changes of the machine's load cancel. Reported are, per
 algorithm and batch size,
 
-* ``ms``: median of the time per update, and ``ratio``: how much longer the peer's takes;
+* ``ms``: median of the time per update, and ``ratio``: how much longer Stable-Baselines3's takes;
 * ``cpu_ms`` and ``cpu_ratio``: the same of the processor time, as its lower quartile, which the
   machine's other work disturbs less;
+* ``of_limit``: share of the arithmetic limit that is reached, in processor time. The limit is the
+  row "matrix products": all that SAC with two critics cannot do without, in float32, in the sizes
+  of the update, and nothing else. It takes its turn as the algorithms do. bfloat16 may exceed it;
 * ``gemm_ms``, ``gemm_share``, ``gflops``: time, share and speed of the matrix products (PyTorch
   only). If all else were free, ``limit`` would be the ``cpu_ratio``.
 
-Prints a table and one JSON object. Run: python benchmarks/updates.py [--rounds N] [--json FILE]
+Prints a table and one JSON object.
+Run: python benchmarks/updates.py [--rounds N] [--sizes BATCH,LAYER,... ...] [--json FILE]
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,22 +38,35 @@ import hydra
 import numpy as np
 import torch
 from torch.profiler import ProfilerActivity, profile
+from turns import publish, take_turns, timed
 
 from scilab_rl import assembly, config
 from scilab_rl.envs.vectorize import make_train_env
 from scilab_rl.workspace import open_desk
 
 PEER = "stable-baselines3"
-SBX = "sbx"
+PRODUCTS = "matrix products"
 PEERS_PYTHON = Path(__file__).parents[1] / ".venv-peers" / "bin" / "python"
 
 
 class Entry(NamedTuple):
-    """A row of the table: name, overrides of the configuration, and updates per round."""
+    """A row of the table.
+
+    Attributes:
+        name: What it is called.
+        overrides: Of the configuration; none for what is not ours.
+        updates_per_call: In one round.
+        script: Of a peer in the other virtual environment.
+        only_layers: The only ones that it has.
+        has_limit: Whether the arithmetic limit is its own.
+    """
 
     name: str
-    overrides: tuple[str, ...]
+    overrides: tuple[str, ...] = ()
     updates_per_call: int = 1
+    script: str | None = None
+    only_layers: tuple[int, ...] | None = None
+    has_limit: bool = True
 
 
 ENTRIES = (
@@ -54,68 +74,83 @@ ENTRIES = (
     Entry(f"{PEER}, our buffer", ("algorithm=sac",)),
     Entry("cleansac", ("algorithm=cleansac",)),
     Entry("cleansac bfloat16", ("algorithm=cleansac", "algorithm.precision=bfloat16")),
-    Entry(SBX, ()),
+    Entry("sbx", script="sbx_sac.py"),
+    Entry("tianshou", script="tianshou_sac.py"),
+    # Two at a time, because its actor learns every second time.
+    Entry("cleanrl", updates_per_call=2, script="cleanrl_sac.py", only_layers=(256, 256)),
     Entry("jaxsac", ("algorithm=jaxsac",)),
     Entry("jaxsac, 8 in a round", ("algorithm=jaxsac",), 8),
     Entry("jaxsac bfloat16, 8 in a round", ("algorithm=jaxsac", "algorithm.precision=bfloat16"), 8),
-    Entry("jaxtd3, 8 in a round", ("algorithm=jaxtd3",), 8),
+    Entry("jaxtd3, 8 in a round", ("algorithm=jaxtd3",), 8, has_limit=False),
+    Entry(PRODUCTS),
 )
 # Batch size and hidden layers.
-SIZES = ((256, (256, 256)), (2048, (512, 512, 512)))
+SIZES = ("256,256,256", "2048,512,512,512")
 N_STEPS = 5_000
-EPISODE = 50
+N_OBSERVATIONS, N_ACTIONS = 16, 4  # of FetchReach, goals included
 GEMM = ("aten::bmm", "aten::baddbmm", "aten::mm", "aten::addmm")
+Step = tuple[Any, ...]
 Results = dict[str, dict[str, float]]
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rounds", type=int, default=40, help="of the smaller batch")
+    parser.add_argument("--rounds", type=int, default=40, help="of a batch of 256; default 40")
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--only", nargs="*", help="names of rows")
+    parser.add_argument(
+        "--sizes", nargs="*", default=SIZES, metavar="BATCH,LAYER,...", help="of the updates"
+    )
+    parser.add_argument("--steps", type=int, default=N_STEPS, help="recorded; default 5000")
     parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
     arguments = parser.parse_args()
     open_desk()
     entries = [entry for entry in ENTRIES if not arguments.only or entry.name in arguments.only]
     if not PEERS_PYTHON.exists():
-        sys.stdout.write("Without sbx: `make .venv-peers/.installed` installs the peers.\n")
-        entries = [entry for entry in entries if entry.name != SBX]
+        sys.stdout.write("Some peers are missing: `make .venv-peers/.installed` installs them.\n")
+        entries = [entry for entry in entries if entry.script is None]
+    torch.set_num_threads(arguments.threads)
+    steps = recorded_steps(arguments.steps)
     report: dict[str, Any] = {"threads": arguments.threads}
-    for batch_size, net_arch in SIZES:
-        rounds = max(3, arguments.rounds * 256 // batch_size)
-        results = measure(entries, batch_size, net_arch, rounds, arguments.threads)
-        report[f"batch {batch_size}, {list(net_arch)}"] = results
-        sys.stdout.write(f"{table(batch_size, net_arch, results)}\n\n")
-        sys.stdout.flush()
-    report["load_average"] = os.getloadavg()[0]
-    text = json.dumps(report, indent=2)
-    sys.stdout.write(text + "\n")
-    if arguments.json:
-        arguments.json.write_text(text + "\n", encoding="utf-8")
+    tables = []
+    for size in arguments.sizes:
+        batch_size, *net_arch = map(int, size.split(","))
+        rounds = min(arguments.rounds, max(3, arguments.rounds * 256 // batch_size))
+        results = measure(entries, batch_size, tuple(net_arch), rounds, steps)
+        report[f"batch {batch_size}, {net_arch}"] = results
+        tables.append(table(batch_size, net_arch, results))
+    publish("\n\n".join(tables), report, arguments.json)
 
 
 def measure(
-    entries: list[Entry], batch_size: int, net_arch: tuple[int, ...], rounds: int, threads: int
+    entries: Sequence[Entry],
+    batch_size: int,
+    net_arch: tuple[int, ...],
+    rounds: int,
+    steps: list[Step],
 ) -> Results:
     """Let all algorithms take turns."""
-    updates = {entry.name: prepare(entry, batch_size, net_arch, threads) for entry in entries}
-    times: dict[str, list[tuple[float, float]]] = {name: [] for name in updates}
-    for update in updates.values():
+    entries = [entry for entry in entries if entry.only_layers in (None, net_arch)]
+    updates = {entry.name: prepare(entry, batch_size, net_arch, steps) for entry in entries}
+    for update in updates.values():  # compiles
         update()
         update()
-    for _ in range(rounds):
-        for name in (*updates, *reversed(updates)):
-            started = time.perf_counter(), time.process_time()
-            elsewhere = updates[name]() or 0.0
-            wall, cpu = time.perf_counter() - started[0], time.process_time() - started[1]
-            times[name].append((wall, cpu + elsewhere))
+    turns = {name: partial(timed, update) for name, update in updates.items()}
+    times = take_turns(turns, rounds)
     results: Results = {}
     for entry in entries:
         wall, cpu = 1e3 * np.array(times[entry.name]).T / entry.updates_per_call
         row = {"ms": float(np.median(wall)), "cpu_ms": float(np.quantile(cpu, 0.25))}
-        row |= matrix_products(updates[entry.name], entry.updates_per_call)
+        if entry.overrides:
+            row |= matrix_products(updates[entry.name], entry.updates_per_call)
         results[entry.name] = row
+    if PRODUCTS in results:
+        limit = results[PRODUCTS]
+        limit["gflops"] = gflop(batch_size, net_arch) / limit["cpu_ms"] * 1e3
+        for entry in entries:
+            if entry.has_limit:
+                results[entry.name]["of_limit"] = limit["cpu_ms"] / results[entry.name]["cpu_ms"]
     for row in results.values() if PEER in results else ():
         row["ratio"] = results[PEER]["ms"] / row["ms"]
         row["cpu_ratio"] = results[PEER]["cpu_ms"] / row["cpu_ms"]
@@ -125,28 +160,20 @@ def measure(
 
 
 def prepare(
-    entry: Entry, batch_size: int, net_arch: tuple[int, ...], threads: int
+    entry: Entry, batch_size: int, net_arch: tuple[int, ...], steps: list[Step]
 ) -> Callable[[], Any]:
     """Build an algorithm with data, and return what does its updates."""
-    if entry.name == SBX:
-        return peer_process("sbx_sac.py", batch_size, net_arch)
+    if entry.name == PRODUCTS:
+        return all_products(batch_size, net_arch)
+    if entry.script is not None:
+        return peer_process(entry, batch_size, net_arch, steps)
     layers = f"[{','.join(map(str, net_arch))}]"
     is_peer = entry.overrides[0] == "algorithm=sac"
     architecture = f"algorithm.policy_kwargs={{net_arch:{layers}}}" if is_peer else ""
     overrides = [*entry.overrides, architecture or f"algorithm.net_arch={layers}"]
-    cfg = config.compose(
-        [
-            *overrides,
-            f"algorithm.batch_size={batch_size}",
-            "env=FetchReach",
-            "seed=1",
-            "tuned=false",
-        ]
-    )
-    torch.set_num_threads(threads)
-    env = make_train_env(assembly.env_settings(cfg))
-    algorithm = assembly.make_algorithm(cfg, env)
-    for step in recorded_steps(env):
+    cfg = configure(*overrides, f"algorithm.batch_size={batch_size}")
+    algorithm = assembly.make_algorithm(cfg, make_train_env(assembly.env_settings(cfg)))
+    for step in steps:
         algorithm.replay_buffer.add(*step)
     if is_peer:
         from scilab_rl.metrics.logger import MetricLogger
@@ -164,33 +191,61 @@ def prepare(
     return update_round
 
 
-def peer_process(script: str, batch_size: int, net_arch: tuple[int, ...]) -> Callable[[], float]:
-    """Start a peer in its own virtual environment, and return what makes it do one update.
+def configure(*overrides: str) -> Any:
+    """Return the configuration of a run on FetchReach without anybody's tuned values."""
+    return config.compose([*overrides, "env=FetchReach", "seed=1", "tuned=false"])
+
+
+def peer_process(
+    entry: Entry, batch_size: int, net_arch: tuple[int, ...], steps: list[Step]
+) -> Callable[[], float]:
+    """Start a peer in its own virtual environment, and return what makes it do its updates.
 
     The function returns the seconds of processor time that the peer took.
     """
-    command = [PEERS_PYTHON, Path(__file__).parent / "peers" / script, batch_size, *net_arch]
-    process = subprocess.Popen(
-        list(map(str, command)), stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdin is not None and process.stdout is not None
-    requests, answers = process.stdin, process.stdout
-    answers.readline()  # it is ready
+    now, following, actions, rewards, dones, _ = zip(*steps, strict=True)
+    arrays = {"actions": actions, "rewards": rewards, "dones": dones}
+    for when, observations in (("now", now), ("following", following)):
+        arrays |= {
+            f"{when}/{key}": [observation[key] for observation in observations]
+            for key in observations[0]
+        }
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "steps.npz"
+        # One environment, whose dimension the peers do without.
+        np.savez(path, **{name: np.concatenate(values) for name, values in arrays.items()})
+        script = Path(__file__).parent / "peers" / str(entry.script)
+        process = subprocess.Popen(
+            list(map(str, [PEERS_PYTHON, script, path, batch_size, *net_arch])),
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            env=os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())},
+        )
+        assert process.stdin is not None and process.stdout is not None
+        requests, answers = process.stdin, process.stdout
+        if not answers.readline():  # it would be ready
+            raise SystemExit(f"{script} has failed, see above.")
 
     def update() -> float:
-        requests.write("update\n")
+        requests.write(f"{entry.updates_per_call}\n")
         requests.flush()
         return float(answers.readline())
 
     return update
 
 
-def recorded_steps(env: Any) -> Iterator[tuple[Any, ...]]:
-    """Yield the same steps with random actions for everybody, as arguments of ``add``."""
+def recorded_steps(n: int) -> list[Step]:
+    """Return the same steps with random actions for everybody, as arguments of ``add``."""
+    return list(random_steps(make_train_env(assembly.env_settings(configure())), n))
+
+
+def random_steps(env: Any, n: int) -> Iterator[Step]:
+    """Take steps with random actions."""
     env.seed(1)
     random = np.random.default_rng(1)
     now = env.reset()
-    for _ in range(N_STEPS):
+    for _ in range(n):
         actions = random.uniform(-1, 1, size=(1, *env.action_space.shape)).astype(np.float32)
         after, rewards, dones, infos = env.step(actions)
         following = after
@@ -199,6 +254,55 @@ def recorded_steps(env: Any) -> Iterator[tuple[Any, ...]]:
             following = {key: entry[np.newaxis] for key, entry in last.items()}
         yield now, following, actions, rewards, dones, infos
         now = after
+
+
+def products_of_sac(
+    batch_size: int, net_arch: Sequence[int]
+) -> list[tuple[int, tuple[int, int, int]]]:
+    """Return how often an update multiplies which matrices.
+
+    A layer is needed forwards, for the gradient of its weights, and for that of its inputs, which
+    the first layer needs only where the gradient goes on: from the critics into the actions.
+
+    Shapes:
+        result: ``(count, (m, k, n))`` for products of ``(m, k)`` with ``(k, n)``.
+    """
+    actor = list(pairwise([N_OBSERVATIONS, *net_arch, 2 * N_ACTIONS]))
+    critic = list(pairwise([N_OBSERVATIONS + N_ACTIONS, *net_arch, 1]))
+    b = batch_size
+    products: list[tuple[int, tuple[int, int, int]]] = []
+    for n_in, n_out in actor:  # for the target and for the actor's loss
+        products += [(2, (b, n_in, n_out)), (1, (n_in, b, n_out))]
+    products += [(1, (b, n_out, n_in)) for n_in, n_out in actor[1:]]
+    for n_in, n_out in critic:  # two, each in the target and in both losses
+        products += [(6, (b, n_in, n_out)), (2, (n_in, b, n_out)), (2, (b, n_out, n_in))]
+    products += [(2, (b, n_out, n_in)) for n_in, n_out in critic[1:]]
+    return products
+
+
+def gflop(batch_size: int, net_arch: Sequence[int]) -> float:
+    """Return the arithmetic of an update.
+
+    >>> round(gflop(256, [256, 256]), 3)
+    0.575
+    """
+    products = products_of_sac(batch_size, net_arch)
+    return sum(count * 2 * m * k * n for count, (m, k, n) in products) / 1e9
+
+
+def all_products(batch_size: int, net_arch: Sequence[int]) -> Callable[[], None]:
+    """Return what multiplies all matrices of an update, and does nothing else."""
+    matrices = [
+        (count, torch.randn(m, k), torch.randn(k, n), torch.empty(m, n))
+        for count, (m, k, n) in products_of_sac(batch_size, net_arch)
+    ]
+
+    def multiply() -> None:
+        for count, left, right, out in matrices:
+            for _ in range(count):
+                torch.mm(left, right, out=out)
+
+    return multiply
 
 
 def matrix_products(update: Callable[[], Any], n_updates: int) -> dict[str, float]:
@@ -230,10 +334,14 @@ def matrix_products(update: Callable[[], Any], n_updates: int) -> dict[str, floa
     }
 
 
-def table(batch_size: int, net_arch: tuple[int, ...], results: Results) -> str:
+def table(batch_size: int, net_arch: Sequence[int], results: Results) -> str:
     """Return one block of the table."""
-    columns = ("ms", "ratio", "cpu_ms", "cpu_ratio", "gemm_ms", "gemm_share", "gflops", "limit")
-    lines = [f"batch {batch_size}, {list(net_arch)}"]
+    columns = (
+        "ms", "ratio", "cpu_ms", "cpu_ratio", "of_limit", "gemm_ms", "gemm_share", "gflops",
+        "limit",
+    )  # fmt: skip
+    work = gflop(batch_size, net_arch)
+    lines = [f"batch {batch_size}, {list(net_arch)}: {work:.3f} GFLOP per update of SAC"]
     lines.append(f"{'':32}" + "".join(f"{column:>12}" for column in columns))
     for name, row in results.items():
         cells = (f"{row[column]:12.2f}" if column in row else f"{'':12}" for column in columns)

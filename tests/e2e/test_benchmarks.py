@@ -1,0 +1,141 @@
+"""Every benchmark in its smallest size, and the arithmetic that they share."""
+
+from __future__ import annotations
+
+import importlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from .commands import ROOT
+
+BENCHMARKS = ROOT / "benchmarks"
+SMALL_RUN = (
+    "algorithm.batch_size=16", "algorithm.net_arch=[16]", "algorithm.buffer_size=2000",
+    "algorithm.learning_starts=20",
+)  # fmt: skip
+SMALLER_SHOWING = "import showing; showing.N_PAIRS = 2; showing.REPEATS = 1; showing.main()"
+SMALLER_STUDY = """
+import study
+if __name__ == "__main__":
+    study.SECONDS, study.N_WAITING, study.N_TRAININGS, study.N_WORKERS = (0.5, 1.0), 4, 2, 2
+    study.main()
+"""
+# By the name in `benchmarks/all.py`: what runs instead, and what has to be among the figures.
+SMALLEST = {
+    "startup": (["startup.py", "--rounds", "1"], "jaxsac"),
+    "updates": (
+        ["updates.py", "--rounds", "1", "--sizes", "32,16", "--steps", "150"],
+        "batch 32, [16]",
+    ),
+    "replay": (["replay.py", "--transitions", "4000"], "ours"),
+    "checkpoint": (["checkpoint_1m.py", "--transitions", "1000"], "save_seconds"),
+    "environments": (["environments.py", "--steps", "1"], 0),
+    "scaling": (
+        ["scaling.py", "--rounds", "1", "--steps", "2", "--sizes", "32,16", "--n-envs", "1", "2"],
+        "updates",
+    ),
+    "cost": (["cost.py", "--rounds", "1", "--steps", "60", *SMALL_RUN], "declared metrics"),
+    "showing": (["-c", SMALLER_SHOWING], "stuck_viewer"),
+    "study": (["smaller_study.py"], "unequal"),
+    "metrics": (["load.py", "metrics", "--scale", "0.01"], "part"),
+    "reach": (
+        [
+            "time_to_success.py", "reach", "--seeds", "1", "--only", "cleansac", "n_epochs=1",
+            "eval_after_n_steps=60", "n_test_rollouts=1", *SMALL_RUN,
+        ],
+        "runs",
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture
+def benchmarks(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+
+    return importlib.import_module
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", SMALLEST)
+def test_runs_in_its_smallest_size(name: str, tmp_path: Path, benchmarks: Any) -> None:
+    if name == "showing":
+        pytest.importorskip("rerun")
+    if name in ("startup", "updates", "scaling", "cost"):
+        pytest.importorskip("jax")
+    if name == "cost":
+        pytest.importorskip("mlflow")
+        pytest.importorskip("tensorboard")
+    words, expected = SMALLEST[name]
+    if name == "study":  # its workers are started from a file
+        (tmp_path / words[0]).write_text(SMALLER_STUDY, encoding="utf-8")
+        words = [str(tmp_path / words[0])]
+    elif words[0].endswith(".py"):
+        words = [str(BENCHMARKS / words[0]), *words[1:]]
+    figures = tmp_path / "figures.json"
+    done = subprocess.run(
+        [sys.executable, *words, *benchmarks("all").BENCHMARKS[name].json, str(figures)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=600,
+        env=os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(BENCHMARKS)},
+        check=False,
+    )
+    assert figures.exists(), done.stderr
+    content = json.loads(figures.read_text(encoding="utf-8"))
+    assert content[expected]
+    assert done.stdout.rstrip().endswith(("}", "]"))  # the figures come after the table
+    if name != "metrics":  # which says in its exit code whether the machine was quick enough
+        assert done.returncode == 0, done.stderr
+
+
+def test_each_script_has_a_name_and_each_name_a_smallest_size(benchmarks: Any) -> None:
+    named = {benchmark.words[0] for benchmark in benchmarks("all").BENCHMARKS.values()}
+    scripts = {path.name for path in BENCHMARKS.glob("*.py")}
+    # `gates.py` simulates statistics and draws a figure; it measures nothing.
+    assert named == scripts - {"all.py", "turns.py", "gates.py"}
+    run_here = {benchmarks("all").BENCHMARKS[name].words[0] for name in SMALLEST}
+    assert run_here == named
+
+
+def test_arithmetic_of_an_update(benchmarks: Any) -> None:
+    """Batch 2, one layer of 3: actor 16-3-8, critics 20-3-1; counted by hand."""
+    pytest.importorskip("jax")
+    updates = benchmarks("updates")
+    actor, critic = 16 * 3 + 3 * 8, 20 * 3 + 3 * 1
+    forwards = 2 * actor + 2 * 3 * critic  # target and loss of the actor; two critics, thrice
+    weights = actor + 2 * critic
+    inputs = 3 * 8 + 2 * (3 * 1) + 2 * critic  # to the actions through both critics
+    assert updates.gflop(2, [3]) * 1e9 == pytest.approx(2 * 2 * (forwards + weights + inputs))
+
+
+def test_turns_go_forwards_and_backwards(benchmarks: Any) -> None:
+    order: list[str] = []
+    calls = {name: (lambda name=name: order.append(name) or len(order)) for name in "ab"}
+    results = benchmarks("turns").take_turns(calls, 2)
+    assert order == ["a", "b", "b", "a"] * 2
+    assert results == {"a": [1, 4, 5, 8], "b": [2, 3, 6, 7]}
+
+
+def test_ratios_are_those_of_the_same_turn(benchmarks: Any) -> None:
+    compared = benchmarks("turns").relative([2.0, 40.0, 6.0], [1.0, 10.0, 2.0])
+    assert compared["ratio"] == 3.0  # of 2, 4 and 3
+    low, high = compared["interval"]
+    assert 2.0 <= low <= 3.0 <= high <= 4.0
+
+
+def test_a_benchmark_that_nobody_knows(benchmarks: Any) -> None:
+    done = subprocess.run(
+        [sys.executable, str(BENCHMARKS / "all.py"), "updatse"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 2
+    assert "there is no updatse; there is startup, updates" in done.stderr
