@@ -61,11 +61,8 @@ class LiveViewer:
                 "The live view listens on %s: everybody who can reach this machine can look.", host
             )
         self._rerun = rerun
-        self._recording = rerun.RecordingStream(APPLICATION)
-        self.data_port = free_port(DATA_PORT, host)
-        sink = rerun.GrpcServerSink(bind_ip=host, port=self.data_port, server_memory_limit=_MEMORY)
-        self._recording.set_sinks(sink, default_blueprint=layout(panels))
-        self.uri, self._host = sink.uri, host
+        self._recording, self.uri, self.data_port = serve_data(panels, host)
+        self._host = host
         self.address: str | None = None
         self.n_dropped_pictures = 0
         self._page: subprocess.Popen[bytes] | None = None
@@ -185,6 +182,35 @@ class Window:
         if not self.process.returncode:
             return None
         return lines[-1] if lines else f"exit code {self.process.returncode}"
+
+
+def serve_data(panels: tuple[str, ...], host: str) -> tuple[Any, str, int]:
+    """Serve a new recording from this process.
+
+    Args:
+        panels: Names of all metrics that will be shown.
+        host: Address to listen on.
+
+    Returns:
+        The recording, the address for a viewer, and its port.
+
+    Raises:
+        ConfigError: If 50 ports in a row are taken, or the address is not one of this machine.
+    """
+    rerun = import_rerun("for the live view (render=display)")
+    port = DATA_PORT
+    while True:
+        port = free_port(port, host)
+        recording = rerun.RecordingStream(APPLICATION)
+        sink = rerun.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY)
+        recording.set_sinks(sink, default_blueprint=layout(panels))
+        try:
+            recording.flush(timeout_sec=_PATIENCE)
+        except RuntimeError as error:  # somebody else was faster at this port
+            _log.debug("Port %d: %s", port, error)
+            port += 1
+        else:
+            return recording, sink.uri, port
 
 
 def serve_page(source: str, host: str, page_port: int) -> subprocess.Popen[bytes]:

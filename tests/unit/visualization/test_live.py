@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 import psutil
 import pytest
 
-from scilab_rl.visualization.live import LiveViewer, free_port, has_display
+from scilab_rl.visualization.live import LiveViewer, free_port, has_display, serve_data
 from scilab_rl.visualization.records import Record
 
 from .clips import make_clip
@@ -135,3 +135,22 @@ def test_display(
     for name, value in environment.items():
         monkeypatch.setenv(name, value)
     assert has_display() is expected
+
+
+def test_port_that_is_taken_in_the_last_moment(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between the look for a free port and its use, somebody else takes it."""
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = taken.getsockname()[1]
+        monkeypatch.setattr("scilab_rl.visualization.live.DATA_PORT", port)
+        monkeypatch.setattr(
+            "scilab_rl.visualization.live.free_port",
+            lambda first, *_, **__: first if first == port else free_port(first),
+        )
+        recording, uri, chosen = serve_data(("reward",), "127.0.0.1")
+    assert chosen > port
+    assert f":{chosen}/" in uri
+    with socket.create_connection(("127.0.0.1", chosen), timeout=5):
+        pass
+    recording.disconnect()
