@@ -1,9 +1,10 @@
 """Compare the pinned versions with known vulnerabilities: a list of ours, and pip-audit if it can.
 
-The list (``scripts/advisories.csv``) holds advisories of packages that we or our dependencies use,
-as published until the date in its first line. It is not complete and does not grow by itself; it
-catches a pin that goes back to a version known as vulnerable, also without a network. pip-audit
-asks PyPI for all packages; what it could not look up is said, and never counts as good.
+The list (``scripts/advisories.csv``) holds advisories of packages that we or our dependencies use.
+It was written down from memory, without a database at hand, at the date in its first line: it is
+not complete, an entry may be wrong, and it does not grow by itself. It catches a pin that goes back
+to a version that we know as vulnerable, also without a network. pip-audit asks PyPI for all
+packages; what it could not look up is said, and never counts as good.
 
 Run: python scripts/audit.py [--offline]
 """
@@ -68,7 +69,10 @@ def main() -> int:
     """Print the report; 1 if a pin is known as vulnerable."""
     constraints = _ROOT / "constraints.txt"
     problems, n_compared = known_problems(pins(constraints))
-    told = f"{n_compared} advisories of the list concern pinned packages."
+    told = (
+        f"{n_compared} advisories of the list concern pinned packages. The list was written from "
+        "memory and is not complete: check an entry before relying on it."
+    )
     if "--offline" not in sys.argv:
         found, asked = ask_pip_audit(constraints)
         problems, told = problems + found, f"{told} {asked}"

@@ -29,6 +29,7 @@ COMMANDS = {
     "experiment": "train what is missing of a comparison, then compare",
     "performance": "test whether everything still learns as well as it did",
     "export": "write what an agent saw, did and thought as a tidy table",
+    "sync": "send runs to a tracker that was away while they trained",
     "algorithms": "list the algorithms",
     "envs": "list the environments",
     "explain": "show where the value of a key comes from",

@@ -164,7 +164,9 @@ class Session:
         """
         started = time.monotonic()
         outcome: dict[str, Any] = {"status": "failed"}
-        self.trackers.begin(run_info(self.cfg, self.directory, self.trainer, resumed_step))
+        self.trackers.begin(
+            run_info(self.cfg, self.directory, self.trainer.total_steps, resumed_step)
+        )
         try:
             self._learn_until_stopped(outcome, resumed_step or 0)
         except Exception as error:
@@ -305,7 +307,7 @@ def show_episodes(
 
 
 def run_info(
-    cfg: DictConfig, directory: RunDirectory, trainer: Any, resumed_step: int | None
+    cfg: DictConfig, directory: RunDirectory, total_steps: int, resumed_step: int | None
 ) -> RunInfo:
     """Collect what trackers want to know."""
     return RunInfo(
@@ -314,7 +316,7 @@ def run_info(
         env=cfg.env,
         algorithm=cfg.algorithm.name,
         seed=cfg.seed,
-        total_steps=trainer.total_steps,
+        total_steps=total_steps,
         n_epochs=cfg.n_epochs,
         parameters={
             name: mask(value) if isinstance(value, str) else value

@@ -10,10 +10,26 @@ MASK = "***"
 _SHORTEST = 8  # shorter values of variables would hide ordinary words
 _VARIABLE = re.compile(r"(API_?KEY|TOKEN|SECRET|PASSWORD|PASSWD|ACCESS_KEY)$", re.IGNORECASE)
 _IN_ADDRESS = re.compile(r"(?<=://)[^/\s:@]*:[^/\s@]+(?=@)")
+# `name: value`, `"name": "value"`, `name = "value"`, `name: str = f"value"`.
+_IS = r"[\"']?\]?[ \t]*(?::[\w.\[\], |]+[ \t]=|:?={1,2}|:)[ \t]*"
 _NAMED = re.compile(
-    r"((?:api_?key|(?:auth|access|api)_?token|password|secret)[\"']?\s*[:=]\s*[\"']?)"
-    r"(?!null\b|[\"'])[^\s\"',}]+",
+    r"((?:api_?key|(?:auth|access|api)_?token|passw(?:or)?d|secret(?:_?(?:access_?)?key)?"
+    rf"|(?:access|private)_?key){_IS})"
+    r"(?!(?:null|None)\b)"
+    r"(?:([\"'])(?:(?!\2).)+\2|[\"']?[^\s\"',}]+(?:\"[^\"\n]*\"|'[^'\n]*')?)",
     re.IGNORECASE,
+)
+# Words that mean other things too, as in `pad_token: 0`: only with a value that looks drawn.
+_NAMED_LONG = re.compile(
+    rf"((?:token|key|credentials?){_IS}[\"']?)(?=[\w+/=-]*\d)[\w+/=-]{{20,}}", re.IGNORECASE
+)
+# The forms of GitHub, GitLab, Hugging Face, OpenAI, AWS and Slack, and JSON web tokens.
+_FORMS = re.compile(
+    r"\b(?:gh[pousr]_\w{20,}|github_pat_\w{20,}|glpat-[\w-]{20,}|hf_[A-Za-z0-9]{30,}|sk-[\w-]{20,}"
+    r"|AKIA[0-9A-Z]{16}|xox[abprs]-[\w-]{10,}|eyJ[\w-]{10,}\.[\w-]+\.[\w-]+)"
+)
+_PRIVATE_KEY = re.compile(
+    r"(-----BEGIN [A-Z ]*PRIVATE KEY-----).*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL
 )
 
 
@@ -21,7 +37,8 @@ def mask(text: str) -> str:
     """Replace what must not be read by others by ``***``.
 
     That is: passwords in addresses, the values of environment variables that are called a key,
-    token, secret or password, and what stands behind such a name.
+    token, secret or password, what stands behind such a name in configuration or code, and what
+    looks like a key of a known service.
 
     >>> mask("postgresql://ada:lovelace@host/runs")
     'postgresql://***@host/runs'
@@ -31,7 +48,9 @@ def mask(text: str) -> str:
     for name, value in os.environ.items():
         if len(value) >= _SHORTEST and _VARIABLE.search(name):
             text = text.replace(value, MASK)
-    return _NAMED.sub(rf"\g<1>{MASK}", _IN_ADDRESS.sub(MASK, text))
+    text = _PRIVATE_KEY.sub(rf"\g<1>{MASK}\g<2>", _IN_ADDRESS.sub(MASK, text))
+    text = _NAMED.sub(lambda found: f"{found[1]}{found[2] or ''}{MASK}{found[2] or ''}", text)
+    return _FORMS.sub(MASK, _NAMED_LONG.sub(rf"\g<1>{MASK}", text))
 
 
 class MaskingFormatter(logging.Formatter):

@@ -31,7 +31,7 @@ _SIMULATION = ("mujoco", "gymnasium", "gymnasium-robotics", "metaworld", "highwa
 
 
 def write(directory: RunDirectory, overrides: Sequence[str], env: Any) -> None:
-    """Write ``provenance.json`` and, for changed code, ``git.diff``.
+    """Write ``provenance.json`` and, for changed code, ``git.diff``, both without secrets.
 
     Args:
         directory: The run's directory.
@@ -40,7 +40,7 @@ def write(directory: RunDirectory, overrides: Sequence[str], env: Any) -> None:
     """
     diff = _git("diff", "HEAD")
     if diff:
-        files.write_text(directory / "git.diff", diff[:_DIFF_LIMIT_BYTES])
+        files.write_text(directory / "git.diff", mask(diff)[:_DIFF_LIMIT_BYTES])
     files.write_json(
         directory / PROVENANCE_FILE,
         {

@@ -318,3 +318,39 @@ def test_f26_without_ffmpeg_page_and_episode_are_kept(tmp_path: Path) -> None:
     kept = [path.suffix for path in (last_run(tmp_path) / "episodes").iterdir()]
     assert ".mp4" not in kept
     assert kept.count(".npz") == kept.count(".html") == 2
+
+
+# Stands for ffmpeg: the real one encodes, and is killed in the middle of the first video.
+KILLED_ENCODER = """#!{python}
+import os, pathlib, signal, subprocess, sys
+encoder, has_killed = [{ffmpeg!r}, *sys.argv[1:]], pathlib.Path({has_killed!r})
+if "rawvideo" not in sys.argv or has_killed.exists():
+    os.execv(encoder[0], encoder)
+has_killed.touch()
+process = subprocess.Popen(encoder, stdin=subprocess.PIPE)
+process.stdin.write(sys.stdin.buffer.read(1_000_000))
+process.stdin.flush()
+for victim in (process.pid, os.getpid()):
+    os.kill(victim, signal.SIGKILL)
+"""
+
+
+def test_f26_encoder_that_is_killed_costs_one_video(tmp_path: Path) -> None:
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    encoder, has_killed = tmp_path / "ffmpeg", tmp_path / "has_killed"
+    names = {"ffmpeg": ffmpeg.get_ffmpeg_exe(), "has_killed": str(has_killed)}
+    encoder.write_text(KILLED_ENCODER.format(python=sys.executable, **names))
+    encoder.chmod(0o700)
+    options = [PIXELS, *RECORD, "n_epochs=2", "eval_after_n_steps=40"]
+    done = scilab_rl(*options, cwd=tmp_path, IMAGEIO_FFMPEG_EXE=str(encoder))
+    assert done.returncode == 0, done.stderr
+    assert has_killed.exists()
+    said = ".mp4 could not be written: ffmpeg ended before the video did. Training goes on"
+    assert done.stderr.count(said) == done.stderr.count("could not be written") == 1
+    run = last_run(tmp_path)
+    assert json.loads((run / "result.json").read_text())["status"] == "finished"
+    kept = [path for path in (run / "episodes").iterdir() if path.suffix != ".rrd"]
+    for path in kept:
+        check_whole(path)
+    counts = {suffix: sum(p.suffix == suffix for p in kept) for suffix in (".npz", ".html", ".mp4")}
+    assert counts == {".npz": 4, ".html": 4, ".mp4": 3}

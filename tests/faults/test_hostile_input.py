@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 import base64
-import functools
 import http.client
-import http.server
 import io
 import json
+import os
 import pickle
 import re
 import shutil
+import signal
+import socket
 import subprocess
 import sys
 import threading
 import time
 import zipfile
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -26,6 +29,7 @@ import torch
 from scilab_rl.cli import run_command_line
 from scilab_rl.masking import mask
 from scilab_rl.results import RunDirectory, find_run, slug
+from scilab_rl.visualization.live import free_port
 
 from ..e2e.commands import ROOT, command, quiet_environment
 from .harness import ENV, RANDOM, last_run, scilab_rl, wait_until
@@ -338,9 +342,9 @@ def listeners_of(pids: set[int]) -> Iterator[tuple[str, int]]:
 
 
 def tree_of(pid: int) -> set[int]:
-    children = Path(f"/proc/{pid}/task/{pid}/children")
+    """Return a process and all that it or one of its threads has started."""
     found = {pid}
-    if children.exists():
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
         for child in children.read_text().split():
             found |= tree_of(int(child))
     return found
@@ -411,10 +415,55 @@ def test_f35_errors_are_masked_too(tmp_path: Path) -> None:
         ("api_key: null", "api_key: null"),
         ("n_tokens: 5", "n_tokens: 5"),
         ("keys: 5", "keys: 5"),
+        ("pad_token: 0", "pad_token: 0"),
+        ("password:\n  - next", "password:\n  - next"),
+        ("password: str | None = None", "password: *** | None = None"),
+        ("+key = jax.random.PRNGKey(0)", "+key = jax.random.PRNGKey(0)"),
+        (f"index {'0a' * 20}..", f"index {'0a' * 20}.."),
+        ('+password: str = "correct horse"', '+password: str = "***"'),
+        ('+def log_in(password="a b", n=1):', '+def log_in(password="***", n=1):'),
+        ('+password = f"a{b}c"', "+password = ***"),
+        ('+if password == "abc":', '+if password == "***":'),
+        ('+os.environ["MY_API_KEY"] = "abc"', '+os.environ["MY_API_KEY"] = "***"'),
+        ("+AWS_SECRET_ACCESS_KEY=abc/def", "+AWS_SECRET_ACCESS_KEY=***"),
+        (f"+wandb.login(key='{'0a' * 20}')", "+wandb.login(key='***')"),
+        (f"+  token: {'0a' * 10}", "+  token: ***"),
+        (f"+push('ghp_{'0a' * 15}')", "+push('***')"),
+        ("-----BEGIN PRIVATE KEY-----\n+0a\n+-----END PRIVATE KEY-----",
+         "-----BEGIN PRIVATE KEY-----***-----END PRIVATE KEY-----"),
     ],
-)
+)  # fmt: skip
 def test_f35_what_is_masked_and_what_is_not(text: str, masked: str) -> None:
     assert mask(text) == masked
+    assert mask(masked) == masked
+
+
+def test_f35_changed_code_is_kept_without_its_secrets(tmp_path: Path) -> None:
+    def git(*arguments: str) -> None:
+        who = ("-c", "user.name=me", "-c", "user.email=me@localhost")
+        subprocess.run(["git", *who, *arguments], cwd=tmp_path, check=True, capture_output=True)
+
+    code = tmp_path / "upload.py"
+    code.write_text("PASSWORD = 'of-yesterday'\nSPEED = 1\n")
+    git("init", "--quiet")
+    git("add", "upload.py")
+    git("commit", "--quiet", "-m", "first")
+    code.write_text(
+        f"PASSWORD = 'of today'\nSPEED = 2\nlog_in(token='{'0a' * 20}')\n"
+        f"SERVER = 'http://ada:lovelace@localhost'\nPLANTED = '{SECRET}'\n"
+    )
+    done = scilab_rl(*RANDOM, "n_epochs=1", cwd=tmp_path, variables={"MY_TOKEN": SECRET})
+    assert done.code == 0, done.errors
+    changes = (last_run(tmp_path) / "git.diff").read_text().splitlines()
+    assert [line for line in changes if re.match(r"[+-](?![+-])", line)] == [
+        "-PASSWORD = '***'",
+        "-SPEED = 1",
+        "+PASSWORD = '***'",
+        "+SPEED = 2",
+        "+log_in(token='***')",
+        "+SERVER = 'http://***@localhost'",
+        "+PLANTED = '***'",
+    ]
 
 
 def test_f35_values_of_variables(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -454,19 +503,95 @@ def test_no_pickle_is_read_in_the_package() -> None:
     assert sys.version_info >= (3, 10)
 
 
-@pytest.fixture
-def served(tmp_path: Path) -> Iterator[int]:
-    """A page that is served as `scilab-rl view` does; yields the port."""
-    from scilab_rl.commands.view import LocalHandler
+@pytest.fixture(scope="module")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subprocess.Popen, int]]:
+    """`scilab-rl view last --browser` without a display: the process, and the port of its page."""
+    folder = tmp_path_factory.mktemp("viewed")
+    episodes = folder / "data" / "2026-01-02" / "run" / "episodes"
+    (episodes / "folder").mkdir(parents=True)
+    (episodes / "page.npz").touch()
+    # Larger than what the kernel takes from a server whose client does not read.
+    (episodes / "page.html").write_text(f"<html>{' ' * 50_000_000}</html>")
+    (episodes.parent / "config.yaml").touch()
+    with started("view", "run", "--browser", cwd=folder) as (process, said):
+        yield process, int(wait_for(r"Open http://127\.0\.0\.1:(\d+)/page\.html", said)[1])
 
-    (tmp_path / "page.html").write_text("<html></html>")
-    (tmp_path / "folder").mkdir()
-    handler = functools.partial(LocalHandler, directory=str(tmp_path))
-    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    yield server.server_port
-    server.shutdown()
-    server.server_close()
+
+@contextmanager
+def started(*arguments: str, cwd: Path, program: tuple[str, ...] = ()) -> Iterator[Any]:
+    """Run a command line beside the test, without a display; yields it, and where it writes."""
+    said = cwd / "said"
+    environment = quiet_environment(PYTHONPATH=str(ROOT), DISPLAY="", WAYLAND_DISPLAY="")
+    with said.open("wb") as file:
+        process = subprocess.Popen(
+            [*program, *arguments] if program else command(*arguments),
+            cwd=cwd, env=environment, stdout=file, stderr=file, start_new_session=True,
+        )  # fmt: skip
+    try:
+        yield process, said
+    finally:
+        process.terminate()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(60)
+        with suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+
+
+def wait_for(pattern: str, said: Path) -> re.Match[str]:
+    """Wait until a process has written something."""
+    wait_until(lambda: re.search(pattern, said.read_text(errors="replace")), 120)
+    found = re.search(pattern, said.read_text(errors="replace"))
+    assert found
+    return found
+
+
+class Answer(NamedTuple):
+    """What a server has answered: status, headers, and the beginning of what it has sent."""
+
+    status: int
+    headers: dict[str, str]
+    begin: bytes
+
+
+def ask(
+    port: int, path: str, headers: dict[str, str], *, method: str = "GET", body: bytes | None = None
+) -> Answer:
+    """Send a request in which headers are exactly as given."""
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    connection.putrequest(method, path, skip_host=True)
+    for name, value in headers.items():
+        connection.putheader(name, value.format(port=port))
+    if body is not None:
+        connection.putheader("Content-Length", str(len(body)))
+    connection.endheaders(body)
+    answer = connection.getresponse()
+    sent = {name.lower(): value for name, value in answer.getheaders()}
+    found = Answer(answer.status, sent, answer.read1(1000))
+    connection.close()
+    return found
+
+
+@contextmanager
+def slow_client(port: int, request: bytes) -> Iterator[None]:
+    """Ask for something large and read one byte of the answer per second."""
+    has_ended = threading.Event()
+
+    def read() -> None:
+        while not has_ended.wait(1.0):
+            client.recv(1)
+
+    with socket.socket() as client:
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
+        client.connect(("127.0.0.1", port))
+        client.sendall(request)
+        assert client.recv(1)  # it is being served
+        reading = threading.Thread(target=read)
+        reading.start()
+        try:
+            yield
+        finally:
+            has_ended.set()
+            reading.join()
 
 
 @pytest.mark.parametrize(
@@ -492,14 +617,135 @@ def served(tmp_path: Path) -> Iterator[int]:
     ],
 )
 def test_f34_pages_for_this_machine_alone(
-    method: str, path: str, headers: dict[str, str], status: int, served: int
+    method: str, path: str, headers: dict[str, str], status: int, viewed: Any
 ) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", served, timeout=10)
-    connection.putrequest(method, path, skip_host=True)
-    for name, value in headers.items():
-        connection.putheader(name, value.format(port=served))
-    connection.endheaders()
-    answer = connection.getresponse()
-    answer.read()
-    connection.close()
-    assert answer.status == status
+    process, port = viewed
+    assert ask(port, path, headers, method=method).status == status
+    assert process.poll() is None
+
+
+def test_f34_slow_clients_block_nobody_and_end_with_the_server(viewed: Any) -> None:
+    """Last of those that use this server: it is ended here, while it serves a slow client."""
+    process, port = viewed
+    request = b"GET /page.html HTTP/1.0\r\nHost: localhost\r\n\r\n"
+    with slow_client(port, request), slow_client(port, request):
+        assert ask(port, "/page.html", {"Host": "localhost"}).begin.startswith(b"<html>")
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 130
+
+
+READ_LIVE_DATA = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
+GRPC_WEB = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
+NO_MESSAGE = bytes(5)  # the frame of an empty message
+
+
+@pytest.fixture
+def shown(tmp_path: Path) -> Iterator[tuple[subprocess.Popen, int, int]]:
+    """A training with a live view in the browser; the ports of its page and of its data."""
+    pytest.importorskip("rerun")
+    endless = ("algorithm=random", ENV, "n_epochs=100000", "eval_after_n_steps=40",
+               "n_test_rollouts=1", "mlflow=0", "tuned=false", "render=display",
+               "render_freq=1")  # fmt: skip
+    with started(*endless, cwd=tmp_path) as (process, said):
+        found = wait_for(r"Live view: http://127\.0\.0\.1:(\d+)/\?url=.*%3A(\d+)%2Fproxy", said)
+        wait_until(lambda: list(tmp_path.glob("data/*/*/metrics.csv")), 120)
+        yield process, int(found[1]), int(found[2])
+
+
+def test_f34_live_data_are_not_for_pages_from_elsewhere(shown: Any) -> None:
+    """The server is Rerun's. A browser gives its answers to pages of this machine only."""
+    _, page_port, data_port = shown
+    asked = {"Access-Control-Request-Method": "POST",
+             "Access-Control-Request-Headers": "content-type,x-grpc-web"}  # fmt: skip
+    allowed = {}
+    for origin in ("https://attacker.example", "http://localhost.attacker.example", "null",
+                   f"http://127.0.0.1:{page_port}"):  # fmt: skip
+        told = {"Host": "127.0.0.1:{port}", "Origin": origin}
+        for method, more, body in (("OPTIONS", asked, None), ("POST", GRPC_WEB, NO_MESSAGE)):
+            answer = ask(data_port, READ_LIVE_DATA, told | more, method=method, body=body)
+            assert answer.status == 200
+            allowed[origin, method] = answer.headers.get("access-control-allow-origin")
+    own = f"http://127.0.0.1:{page_port}"
+    assert {key: value for key, value in allowed.items() if value is not None} == {
+        (own, "OPTIONS"): own,
+        (own, "POST"): own,
+    }
+
+
+def test_f34_slow_clients_of_the_live_view_delay_neither_training_nor_its_end(
+    shown: Any, tmp_path: Path
+) -> None:
+    process, page_port, data_port = shown
+    (metrics,) = tmp_path.glob("data/*/*/metrics.csv")
+    headers = "".join(f"{name}: {value}\r\n" for name, value in GRPC_WEB.items())
+    for_data = f"POST {READ_LIVE_DATA} HTTP/1.1\r\nHost: localhost\r\n{headers}"
+    for_page = b"GET /re_viewer_bg.wasm HTTP/1.1\r\nHost: localhost\r\n\r\n"
+    with slow_client(data_port, f"{for_data}Content-Length: 5\r\n\r\n".encode() + NO_MESSAGE):
+        with slow_client(page_port, for_page):
+            told = {"Host": "localhost"} | GRPC_WEB
+            answer = ask(data_port, READ_LIVE_DATA, told, method="POST", body=NO_MESSAGE)
+            assert answer.status == 200
+            written = metrics.stat().st_size
+            wait_until(lambda: metrics.stat().st_size > written)
+            process.send_signal(signal.SIGTERM)
+            assert process.wait(30) == 143
+
+
+@pytest.fixture(scope="module")
+def mlflow_ui(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subprocess.Popen, int]]:
+    """What `make mlflow` starts, with a port of its own; yields the process and the port."""
+    pytest.importorskip("mlflow")
+    (told,) = re.findall(r"^\t\$\(BIN\)/mlflow (ui .*)$", (ROOT / "Makefile").read_text(), re.M)
+    port = free_port(15_000)
+    arguments = re.sub(r"--port \d+", f"--port {port} --workers 1", told).split()
+    folder = tmp_path_factory.mktemp("mlflow")
+    (folder / "data").mkdir()
+    with started(*arguments, cwd=folder, program=(sys.executable, "-m", "mlflow")) as (process, _):
+        wait_until(
+            lambda: port in (number for _, number in listeners_of(tree_of(process.pid))), 120
+        )
+        yield process, port
+
+
+@pytest.mark.slow
+def test_f33_mlflow_ui_listens_to_this_machine_only(mlflow_ui: Any) -> None:
+    process, port = mlflow_ui
+    listening = list(listeners_of(tree_of(process.pid)))
+    assert port in [number for _, number in listening]
+    assert [address for address, _ in listening if address not in LOOPBACK] == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({"Host": "127.0.0.1:{port}"}, 200),
+        ({"Host": "attacker.example"}, 403),
+        ({"Host": "localhost:{port}", "Origin": "https://attacker.example"}, 403),
+    ],
+)
+def test_f34_mlflow_ui_refuses_pages_from_elsewhere(
+    headers: dict[str, str], status: int, mlflow_ui: Any
+) -> None:
+    path, body = "/api/2.0/mlflow/experiments/search", b'{"max_results": 1}'
+    told = headers | {"Content-Type": "application/json"}
+    assert ask(mlflow_ui[1], path, told, method="POST", body=body).status == status
+
+
+@pytest.mark.slow
+def test_f33_dashboard_of_a_study_listens_to_this_machine_only(tmp_path: Path) -> None:
+    pytest.importorskip("optuna_dashboard")
+    import optuna
+
+    study = tmp_path / "data" / "studies" / "mine"
+    study.mkdir(parents=True)
+    (study / "study.yaml").write_text("sweeper: {storage: null}\n")
+    optuna.create_study(storage=f"sqlite:///{study / 'study.db'}", study_name="mine")
+    port = free_port(16_000)
+    arguments = ("study", "mine", "--dashboard", "--port", str(port))
+    with started(*arguments, cwd=tmp_path) as (process, _):
+        wait_until(lambda: list(listeners_of(tree_of(process.pid))), 120)
+        listening = list(listeners_of(tree_of(process.pid)))
+        assert port in [number for _, number in listening]
+        assert [address for address, _ in listening if address not in LOOPBACK] == []

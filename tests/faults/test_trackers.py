@@ -14,10 +14,11 @@ from typing import Any
 
 import pytest
 
-from scilab_rl.results import RunResult
+from scilab_rl.results import RunDirectory, RunResult, read_epochs
 from scilab_rl.tracking.base import RunInfo, Tracker
 from scilab_rl.tracking.mirror import Mirror
 
+from .environment import ID
 from .harness import RANDOM, allows_namespaces, content, last_run, result_of, scilab_rl
 
 
@@ -127,6 +128,36 @@ def test_f21_server_that_is_not_there(kind: str, tmp_path: Path) -> None:
     assert done.errors.count("mlflow is switched off for this run") == 1
     assert "Traceback" not in done.errors
     assert content(last_run(tmp_path)) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # MLflow's own
+def test_f21_what_a_server_has_missed_is_sent_later(tmp_path: Path) -> None:
+    mlflow = pytest.importorskip("mlflow")
+    away = "tracking.mlflow.tracking_uri=http://127.0.0.1:9"
+    trained = scilab_rl(*RANDOM, "mlflow=1", away, cwd=tmp_path)
+    assert trained.code == 0, trained.errors
+    assert "Send them later: scilab-rl sync RUN --to mlflow" in trained.errors
+    run = last_run(tmp_path)
+    still_away = scilab_rl("sync", "last", cwd=tmp_path)
+    assert still_away.code == 1
+    assert "the same command sends the rest" in still_away.error
+    there = f"sqlite:///{tmp_path / 'there.db'}"
+    for said in ("values and 0 files sent", "complete there already"):
+        done = scilab_rl("sync", "last", "--uri", there, cwd=tmp_path)
+        assert done.code == 0, done.errors
+        assert f"{run.name}: " in done.errors
+        assert said in done.errors
+    client = mlflow.MlflowClient(there)
+    (found,) = client.search_runs([e.experiment_id for e in client.search_experiments()])
+    assert (found.info.run_name, found.info.status) == (run.name, "FINISHED")
+    assert found.data.params["env"] == ID
+    rows = read_epochs(RunDirectory(run))
+    assert len(rows) == 3
+    names = {name for row in rows for name in row} - {"kind", "epoch", "step"}
+    for name in names:
+        history = client.get_metric_history(found.info.run_id, name)
+        assert [(m.step, m.value) for m in history] == [(row["step"], row[name]) for row in rows]
 
 
 @pytest.mark.slow

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from abc import abstractmethod
+from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,35 @@ class Tracker:
 
     def end(self, result: RunResult) -> None:
         """Close; called exactly once, also when the run failed."""
+
+
+@dataclass(frozen=True)
+class Held:
+    """What a place already knows of a run.
+
+    Attributes:
+        steps: The steps at which it has each metric.
+        files: The names of the files that it has; None if it takes none.
+        is_closed: Whether the rest, such as parameters and how the run ended, is complete too.
+    """
+
+    steps: Mapping[str, Set[int]]
+    files: Set[str] | None = None
+    is_closed: bool = True
+
+
+class SyncableTracker(Tracker):
+    """A tracker that can be told later what it has missed, see `scilab_rl.tracking.sync`."""
+
+    @abstractmethod
+    def held(self, run: RunInfo, names: Iterable[str], result: RunResult) -> Held:
+        """Return what is there already; changes nothing, and may be called before `begin`.
+
+        Args:
+            run: The run.
+            names: Of the metrics to look for.
+            result: How the run ended.
+        """
 
 
 class TrackerGroup(Tracker):

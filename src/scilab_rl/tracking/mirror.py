@@ -10,7 +10,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, Tracker
+from scilab_rl.tracking.base import RunInfo, SyncableTracker, Tracker
 
 _log = logging.getLogger(__name__)
 
@@ -95,9 +95,11 @@ class Mirror(Tracker):
     def _switch_off(self, reason: str) -> None:
         if not self._off:
             self._off = True
+            later = isinstance(self.tracker, SyncableTracker)
             _log.warning(
                 "%s is switched off for this run: %s. Nothing is lost: all metrics are in the "
-                "run's own files.",
+                "run's own files.%s",
                 self.label,
                 reason,
+                f" Send them later: scilab-rl sync RUN --to {self.label}" if later else "",
             )

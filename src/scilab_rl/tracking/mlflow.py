@@ -6,13 +6,13 @@ import fcntl
 import os
 import re
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, Tracker
+from scilab_rl.tracking.base import Held, RunInfo, SyncableTracker
 
 _RUN_ID_FILE = "mlflow_run_id.txt"
 _MAX_PARAMETERS = 100  # of one log_batch
@@ -28,9 +28,10 @@ _SETTINGS = {
 }
 _PARENT = "mlflow.parentRunId"
 _STATUS = {"failed": "FAILED", "interrupted": "KILLED"}
+_UNKNOWN = ("RESOURCE_DOES_NOT_EXIST", "INVALID_PARAMETER_VALUE")  # no such run; no run's id at all
 
 
-class MLflowTracker(Tracker):
+class MLflowTracker(SyncableTracker):
     """Writes each epoch as one batch.
 
     Args:
@@ -44,13 +45,11 @@ class MLflowTracker(Tracker):
 
     def begin(self, run: RunInfo) -> None:
         """Create the run, or go on with it after a resume."""
-        _apply_settings()
-        from mlflow.tracking import MlflowClient
-
-        uri = self.tracking_uri or prepare_database(run.base_logdir)
-        self._client = MlflowClient(tracking_uri=uri)
-        stored = run.run_dir / _RUN_ID_FILE
-        if stored.is_file() and self._continues(stored.read_text(encoding="utf-8")):
+        known = self._find(run)
+        if known is not None:
+            self._run_id = known.info.run_id
+            self._client.update_run(self._run_id, status="RUNNING")
+            self._log_parameters(run, known.data.params)
             return
         with _locked(run.base_logdir / ".mlflow.lock"):  # two runs must not both create it
             experiment = self._experiment(run)
@@ -59,8 +58,8 @@ class MLflowTracker(Tracker):
                 tags |= {"group": run.group, _PARENT: self._group(experiment, run.group)}
         created = self._client.create_run(experiment, run_name=run.name, tags=tags)
         self._run_id = created.info.run_id
-        stored.write_text(self._run_id, encoding="utf-8")
-        self._log_parameters(run)
+        (run.run_dir / _RUN_ID_FILE).write_text(self._run_id, encoding="utf-8")
+        self._log_parameters(run, {})
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
         """Write the metrics of an epoch."""
@@ -76,21 +75,56 @@ class MLflowTracker(Tracker):
 
     def end(self, result: RunResult) -> None:
         """Set the final status."""
-        self._client.set_terminated(self._run_id, status=_STATUS.get(result.status, "FINISHED"))
+        self._client.set_terminated(self._run_id, status=_final_status(result))
 
-    def _continues(self, run_id: str) -> bool:
-        """Go on with a stored run; False when this database does not know it."""
+    def held(self, run: RunInfo, names: Iterable[str], result: RunResult) -> Held:
+        """Ask the database."""
+        known = self._find(run)
+        if known is None:
+            return Held({}, frozenset(), is_closed=False)
+        run_id = known.info.run_id
+        has_all_parameters = set(map(_allowed, run.parameters)) <= set(known.data.params)
+        return Held(
+            steps={
+                name: {m.step for m in self._client.get_metric_history(run_id, _allowed(name))}
+                for name in names
+            },
+            files={file.path for file in self._client.list_artifacts(run_id)},
+            is_closed=has_all_parameters and known.info.status == _final_status(result),
+        )
+
+    def _find(self, run: RunInfo) -> Any:
+        """Return the run as the database knows it, or None; opens the database."""
+        _apply_settings()
+        from mlflow.tracking import MlflowClient
+
+        uri = self.tracking_uri or prepare_database(run.base_logdir)
+        self._client = MlflowClient(tracking_uri=uri)
+        stored = run.run_dir / _RUN_ID_FILE
+        known = self._get(stored.read_text(encoding="utf-8")) if stored.is_file() else None
+        if known is not None:
+            return known
+        # The id may be that of another database, or a server has created it and not answered.
+        experiment = self._client.get_experiment_by_name(_project(run))
+        if experiment is None:
+            return None
+        named = f"attributes.run_name = '{run.name}'"
+        found = self._client.search_runs([experiment.experiment_id], named)
+        return found[0] if found else None
+
+    def _get(self, run_id: str) -> Any:
         from mlflow.exceptions import MlflowException
 
         try:
-            self._client.update_run(run_id, status="RUNNING")
-        except MlflowException:
-            return False
-        self._run_id = run_id
-        return True
+            known = self._client.get_run(run_id)
+        except MlflowException as error:
+            if error.error_code in _UNKNOWN:
+                return None
+            raise
+        return known if known.info.lifecycle_stage == "active" else None
 
     def _experiment(self, run: RunInfo) -> str:
-        name = run.project or "scilab-rl"
+        name = _project(run)
         found = self._client.get_experiment_by_name(name)
         if found is not None:
             return found.experiment_id
@@ -108,15 +142,25 @@ class MLflowTracker(Tracker):
         self._client.set_terminated(parent)
         return parent
 
-    def _log_parameters(self, run: RunInfo) -> None:
+    def _log_parameters(self, run: RunInfo, known: Mapping[str, str]) -> None:
+        """Write the parameters that are not known; MLflow refuses to change the others."""
         from mlflow.entities import Param
 
         parameters = [
             Param(_allowed(name), str(value)[:_MAX_VALUE_CHARACTERS])
             for name, value in run.parameters.items()
+            if _allowed(name) not in known
         ]
         for start in range(0, len(parameters), _MAX_PARAMETERS):
             self._client.log_batch(self._run_id, params=parameters[start : start + _MAX_PARAMETERS])
+
+
+def _project(run: RunInfo) -> str:
+    return run.project or "scilab-rl"
+
+
+def _final_status(result: RunResult) -> str:
+    return _STATUS.get(result.status, "FINISHED")
 
 
 def _apply_settings() -> None:

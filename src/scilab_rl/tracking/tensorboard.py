@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, Tracker
+from scilab_rl.tracking.base import Held, RunInfo, SyncableTracker
 
 
-class TensorBoardTracker(Tracker):
+class TensorBoardTracker(SyncableTracker):
     """Writes scalars; read them with ``tensorboard --logdir data``."""
 
     def __init__(self) -> None:
@@ -19,7 +20,17 @@ class TensorBoardTracker(Tracker):
         """Open the event file."""
         from torch.utils.tensorboard import SummaryWriter
 
-        self._writer = SummaryWriter(str(run.run_dir / "tensorboard"))
+        self._writer = SummaryWriter(str(_folder(run)))
+
+    def held(self, run: RunInfo, names: Iterable[str], result: RunResult) -> Held:
+        """Read the event files."""
+        if not _folder(run).is_dir():
+            return Held({})
+        from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+        events = EventAccumulator(str(_folder(run)), size_guidance={"scalars": 0}).Reload()
+        known = events.Tags()["scalars"]
+        return Held({n: {e.step for e in events.Scalars(n)} for n in names if n in known})
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
         """Write the metrics of an epoch."""
@@ -30,3 +41,7 @@ class TensorBoardTracker(Tracker):
     def end(self, result: RunResult) -> None:
         """Close the event file."""
         self._writer.close()
+
+
+def _folder(run: RunInfo) -> Path:
+    return run.run_dir / "tensorboard"

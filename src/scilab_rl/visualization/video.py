@@ -25,11 +25,23 @@ class VideoWriter:
         self._encoder: Any = None
 
     def add(self, frame: np.ndarray) -> None:
-        """Add a frame. Shapes: ``(height, width, 3)``, uint8."""
+        """Add a frame.
+
+        Shapes:
+            frame: ``(height, width, 3)``, uint8.
+
+        Raises:
+            OSError: If the encoder does not take it.
+        """
         if self._encoder is None:
             self._encoder = self._open(frame.shape[1], frame.shape[0])
         height, width = (side - side % _EVEN for side in frame.shape[:2])
-        self._encoder.send(np.ascontiguousarray(frame[:height, :width]))
+        try:
+            self._encoder.send(np.ascontiguousarray(frame[:height, :width]))
+        except OSError as error:  # it holds the whole command, and what ffmpeg has said at its end
+            said = str(error).partition("STDERR OUTPUT:")[2].strip().rpartition("\n")[2]
+            reason = f": {said}" if said else ""
+            raise OSError(f"ffmpeg ended before the video did{reason}") from error
         self.n_frames += 1
 
     def close(self) -> None:
