@@ -26,7 +26,7 @@ class Benchmark(NamedTuple):
     Attributes:
         words: Script and arguments.
         about: What is measured, in a few words.
-        minutes: About how long it takes on two cores; what takes longer than an hour runs only
+        minutes: Roughly how long it takes on two cores; what takes longer than an hour runs only
             when it is named.
         json: Arguments before the file of the figures.
     """
@@ -38,17 +38,17 @@ class Benchmark(NamedTuple):
 
 
 BENCHMARKS = {
-    "startup": Benchmark(("startup.py",), "--help and the first step", 1),
-    "updates": Benchmark(("updates.py",), "updates per second beside the peers'", 12),
-    "replay": Benchmark(("replay.py",), "hindsight replay: speed and memory", 10),
+    "startup": Benchmark(("startup.py",), "--help and the first step", 2),
+    "updates": Benchmark(("updates.py",), "updates per second beside the peers'", 6),
+    "replay": Benchmark(("replay.py",), "hindsight replay: speed and memory", 6),
     "checkpoint": Benchmark(("checkpoint_1m.py",), "saving a replay buffer of 1M", 2),
     "environments": Benchmark(("environments.py",), "our environments beside the originals", 5),
-    "scaling": Benchmark(("scaling.py",), "environments side by side, networks, batches", 10),
-    "cost": Benchmark(("cost.py",), "evaluation, tracking, metrics", 12),
+    "scaling": Benchmark(("scaling.py",), "environments side by side, networks, batches", 5),
+    "cost": Benchmark(("cost.py",), "evaluation, tracking, metrics", 13),
     "showing": Benchmark(("showing.py",), "live view and recording", 5, ()),
-    "study": Benchmark(("study.py",), "how busy a study keeps its workers", 8),
+    "study": Benchmark(("study.py",), "how busy a study keeps its workers", 4),
     "metrics": Benchmark(("load.py", "metrics"), "values recorded per second", 1),
-    "reach": Benchmark(("time_to_success.py", "reach"), "time until FetchReach is mastered", 20),
+    "reach": Benchmark(("time_to_success.py", "reach"), "time until FetchReach is mastered", 40),
     "push": Benchmark(("time_to_success.py", "push"), "time until FetchPush is mastered", 50),
     "pick": Benchmark(("time_to_success.py", "pick"), "FetchPickAndPlace in a fixed budget", 300),
     "slide": Benchmark(("time_to_success.py", "slide"), "FetchSlide in a fixed budget", 300),

@@ -120,44 +120,10 @@ def learn_in_turns(connection: Connection, overrides: Sequence[str]) -> None:
     import hydra
 
     from scilab_rl import config, experiment
-    from scilab_rl.tracking.mirror import Mirror
     from scilab_rl.training import trainer
 
-    begun = evaluation = Seconds(0.0, 0.0)
-    evaluate = trainer.evaluate
-
-    def evaluate_timed(*arguments: Any) -> Any:
-        nonlocal evaluation
-        started = Seconds.now()
-        outcome = evaluate(*arguments)
-        evaluation = Seconds.now() - started
-        return outcome
-
-    def wait(*_: Any) -> bool:
-        nonlocal begun
-        go_on = connection.recv()
-        begun = Seconds.now()
-        return go_on
-
-    written = threading.Semaphore(0)
-    trackers: list[Any] = []
-
-    def report(_step: int, _epoch: int, _values: Mapping[str, float]) -> bool:
-        for tracker in trackers:
-            if not written.acquire(timeout=PATIENCE_SECONDS):
-                raise SystemExit(f"{tracker.label} does not write what it is told.")
-        connection.send((Seconds.now() - begun, evaluation))
-        return wait()
-
-    def watch(session: Any) -> None:
-        trackers.extend(t for t in session.trackers.trackers if isinstance(t, Mirror))
-        for mirror in trackers:
-            mirror.tracker.epoch = followed_by(written.release, mirror.tracker.epoch)
-        session.trainer.may_go_on.append(report)
-        connection.send("ready")
-        wait()
-
-    trainer.evaluate = evaluate_timed
+    watcher = Watcher(connection, trainer.evaluate)
+    trainer.evaluate = watcher.evaluate
     with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
         cfg = config.compose(
             [
@@ -166,7 +132,55 @@ def learn_in_turns(connection: Connection, overrides: Sequence[str]) -> None:
                 *overrides,
             ]
         )  # fmt: skip
-        experiment.run(cfg, watch=watch)
+        experiment.run(cfg, watch=watcher.watch)
+
+
+class Watcher:
+    """Lets a run wait between its epochs, and tells how long they take.
+
+    Args:
+        connection: To the benchmark.
+        evaluate: What evaluates the policy.
+    """
+
+    def __init__(self, connection: Connection, evaluate: Callable[..., Any]) -> None:
+        self._connection = connection
+        self._evaluate = evaluate
+        self._begun = self._evaluation = Seconds(0.0, 0.0)
+        self._trackers: list[Any] = []
+        self._written = threading.Semaphore(0)
+
+    def watch(self, session: Any) -> None:
+        """Attach to a run that is about to begin."""
+        from scilab_rl.tracking.mirror import Mirror
+
+        self._trackers = [t for t in session.trackers.trackers if isinstance(t, Mirror)]
+        for mirror in self._trackers:
+            mirror.tracker.epoch = followed_by(self._written.release, mirror.tracker.epoch)
+        session.trainer.may_go_on.append(self.end_epoch)
+        self._connection.send("ready")
+        self.wait()
+
+    def evaluate(self, *arguments: Any) -> Any:
+        """Evaluate, and note how long it takes."""
+        started = Seconds.now()
+        outcome = self._evaluate(*arguments)
+        self._evaluation = Seconds.now() - started
+        return outcome
+
+    def end_epoch(self, _step: int, _epoch: int, _values: Mapping[str, float]) -> bool:
+        """Report, and wait for the next turn."""
+        for tracker in self._trackers:
+            if not self._written.acquire(timeout=PATIENCE_SECONDS):
+                raise SystemExit(f"{tracker.label} does not write what it is told.")
+        self._connection.send((Seconds.now() - self._begun, self._evaluation))
+        return self.wait()
+
+    def wait(self) -> bool:
+        """Wait for the turn, and return whether there is one."""
+        go_on = self._connection.recv()
+        self._begun = Seconds.now()
+        return go_on
 
 
 def followed_by(tell: Callable[[], object], call: Callable[..., object]) -> Callable[..., None]:

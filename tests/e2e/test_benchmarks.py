@@ -106,7 +106,6 @@ def test_each_script_has_a_name_and_each_name_a_smallest_size(benchmarks: Any) -
 
 def test_arithmetic_of_an_update(benchmarks: Any) -> None:
     """Batch 2, one layer of 3: actor 16-3-8, critics 20-3-1; counted by hand."""
-    pytest.importorskip("jax")
     updates = benchmarks("updates")
     actor, critic = 16 * 3 + 3 * 8, 20 * 3 + 3 * 1
     forwards = 2 * actor + 2 * 3 * critic  # target and loss of the actor; two critics, thrice
