@@ -26,14 +26,14 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
 
+# CleanRL's script runs with newer versions than it asks for, see benchmarks/peers/cleanrl_sac.py.
 .venv-peers/.installed: benchmarks/peers/requirements.txt
 	$(PYTHON) -m venv .venv-peers
 	.venv-peers/bin/pip install --quiet -r benchmarks/peers/requirements.txt
-	# Its script runs with newer versions than it asks for, see benchmarks/peers/cleanrl_sac.py.
 	.venv-peers/bin/pip install --quiet --no-deps --ignore-requires-python cleanrl==1.2.0
 	@touch $@
 
-bench: $(VENV)/.installed .venv-peers/.installed  ## all benchmarks (two hours; BENCH="startup updates": only these)
+bench: $(VENV)/.installed .venv-peers/.installed  ## all benchmarks (hours; BENCH="startup updates": only these)
 	$(BIN)/python benchmarks/all.py $(BENCH)
 
 demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about a minute)
