@@ -24,6 +24,7 @@ Run: python benchmarks/updates.py [--rounds N] [--sizes BATCH,LAYER,... ...] [--
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
 import subprocess
 import sys
@@ -203,18 +204,8 @@ def peer_process(
 
     The function returns the seconds of processor time that the peer took.
     """
-    now, following, actions, rewards, dones, _ = zip(*steps, strict=True)
-    arrays = {"actions": actions, "rewards": rewards, "dones": dones}
-    for when, observations in (("now", now), ("following", following)):
-        arrays |= {
-            f"{when}/{key}": [observation[key] for observation in observations]
-            for key in observations[0]
-        }
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "steps.npz"
-        # One environment, whose dimension the peers do without.
-        np.savez(path, **{name: np.concatenate(values) for name, values in arrays.items()})
-        script = Path(__file__).parent / "peers" / str(entry.script)
+    script = Path(__file__).parent / "peers" / str(entry.script)
+    with written(steps) as path:
         process = subprocess.Popen(
             list(map(str, [PEERS_PYTHON, script, path, batch_size, *net_arch])),
             stdin=subprocess.PIPE,
@@ -233,6 +224,20 @@ def peer_process(
         return float(answers.readline())
 
     return update
+
+
+@contextlib.contextmanager
+def written(steps: list[Step]) -> Iterator[Path]:
+    """Write steps to a file that exists for a while, without the dimension of environments."""
+    now, following, actions, rewards, dones, _ = zip(*steps, strict=True)
+    arrays = {"actions": actions, "rewards": rewards, "dones": dones}
+    for when, observations in (("now", now), ("following", following)):
+        for key in observations[0]:
+            arrays[f"{when}/{key}"] = tuple(observation[key] for observation in observations)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "steps.npz"
+        np.savez(path, **{name: np.concatenate(values) for name, values in arrays.items()})
+        yield path
 
 
 def recorded_steps(n: int) -> list[Step]:

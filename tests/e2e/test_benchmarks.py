@@ -8,8 +8,10 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from .commands import ROOT
@@ -23,7 +25,8 @@ SMALLER_SHOWING = "import showing; showing.N_PAIRS = 2; showing.REPEATS = 1; sho
 SMALLER_STUDY = """
 import study
 if __name__ == "__main__":
-    study.SECONDS, study.N_WAITING, study.N_TRAININGS, study.N_WORKERS = (0.5, 1.0), 4, 2, 2
+    study.SECONDS, study.N_WAITING, study.N_WORKERS = (0.5, 1.0), 4, 2
+    study.n_cores, study.N_TRAININGS = (lambda: 1), 2
     study.main()
 """
 # By the name in `benchmarks/all.py`: what runs instead, and what has to be among the figures.
@@ -46,8 +49,8 @@ SMALLEST = {
     "metrics": (["load.py", "metrics", "--scale", "0.01"], "part"),
     "reach": (
         [
-            "time_to_success.py", "reach", "--seeds", "1", "--only", "cleansac", "n_epochs=1",
-            "eval_after_n_steps=60", "n_test_rollouts=1", *SMALL_RUN,
+            "time_to_success.py", "reach", "n_epochs=1", "eval_after_n_steps=60",
+            "n_test_rollouts=1", *SMALL_RUN, "--seeds", "1", "--only", "cleansac",
         ],
         "runs",
     ),
@@ -57,6 +60,7 @@ SMALLEST = {
 @pytest.fixture
 def benchmarks(monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.syspath_prepend(str(BENCHMARKS / "peers"))
 
     return importlib.import_module
 
@@ -138,3 +142,67 @@ def test_a_benchmark_that_nobody_knows(benchmarks: Any) -> None:
     )
     assert done.returncode == 2
     assert "there is no updatse; there is startup, updates" in done.stderr
+
+
+def test_a_peer_does_as_many_updates_as_it_is_asked_for(tmp_path: Path) -> None:
+    """What it prints does not get between its answers."""
+    script = """
+from recorded import Requests
+requests = Requests()
+print("noise")
+requests.serve(lambda n: print("more noise") or open("asked", "a").write(f"{n} "))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", script],
+        input="2\n8\n",
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(BENCHMARKS / "peers")},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert (tmp_path / "asked").read_text() == "2 8 "
+    assert len([float(line) for line in done.stdout.splitlines()]) == 3  # ready, and two answers
+
+
+def test_peers_get_the_recorded_steps(benchmarks: Any) -> None:
+    updates, recorded = benchmarks("updates"), benchmarks("recorded")
+    steps = [as_added(index, over=index == 2) for index in range(4)]
+    with updates.written(steps) as path:
+        read = list(recorded.read_steps(str(path)))
+    assert [step.over for step in read] == [False, False, True, False]
+    assert [step.reward for step in read] == [-0.0, -1.0, -2.0, -3.0]
+    assert [step.now["goal"].tolist() for step in read] == [[0.0], [1.0], [2.0], [3.0]]
+    assert [step.following["goal"].tolist() for step in read] == [[10.0], [11.0], [12.0], [13.0]]
+    assert [step.action.tolist() for step in read] == [[0.0], [0.1], [0.2], [0.3]]
+
+
+def as_added(index: int, *, over: bool) -> tuple:
+    now, following = ({"goal": np.array([[value]])} for value in (index, index + 10.0))
+    action, infos = np.array([[index / 10]]).round(1), [{}]
+    return now, following, action, np.array([-float(index)]), np.array([over]), infos
+
+
+def test_the_script_of_cleanrl_waits_after_the_recorded_steps(benchmarks: Any) -> None:
+    recorded, cleanrl = benchmarks("recorded"), benchmarks("cleanrl_sac")
+    steps = [
+        recorded.Step(
+            {"goal": np.array([float(n)])}, {"goal": np.array([n + 0.5])}, np.array([n / 10]), -n,
+            n == 1,
+        )
+        for n in range(3)
+    ]  # fmt: skip
+    asked = iter([2, 0])
+    env = cleanrl.WaitingEnv(steps, SimpleNamespace(next=lambda: next(asked)))
+    actions = [env.single_action_space.sample().item() for _ in steps]
+    assert actions == [0.0, 0.1, 0.2]
+    assert env.reset().item() == 0.0
+    outcomes = [env.step(None) for _ in steps]
+    assert [outcome[0].item() for outcome in outcomes] == [1.0, 2.0, 0.0]
+    assert outcomes[1][3][0]["terminal_observation"].item() == 1.5
+    assert [outcome[2].item() for outcome in outcomes] == [False, True, False]
+    env.step(None)  # `learning-starts` itself; the next two are the two that were asked for
+    env.step(None)
+    env.step(None)
+    with pytest.raises(SystemExit):
+        env.step(None)
