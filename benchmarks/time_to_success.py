@@ -51,9 +51,9 @@ TASKS = {
             PEER: ("algorithm=sac", HER),
         },
     ),
-    "push": Task("FetchPush-v4", 10_000, 500_000, {"jaxsac": ("algorithm=jaxsac",)}),
-    "pick": Task("FetchPickAndPlace-v4", 10_000, 500_000, {"jaxsac": ("algorithm=jaxsac",)}),
-    "slide": Task("FetchSlide-v4", 10_000, 500_000, {"jaxsac": ("algorithm=jaxsac",)}),
+    "push": Task("FetchPush-v4", 20_000, 600_000, {"jaxtd3": ("algorithm=jaxtd3",)}),
+    "pick": Task("FetchPickAndPlace-v4", 20_000, 600_000, {"jaxtd3": ("algorithm=jaxtd3",)}),
+    "slide": Task("FetchSlide-v4", 20_000, 600_000, {"jaxtd3": ("algorithm=jaxtd3",)}),
 }
 
 
