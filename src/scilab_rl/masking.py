@@ -21,15 +21,15 @@ _NAMED = re.compile(
 )
 # Words that mean other things too, as in `pad_token: 0`: only with a value that looks drawn.
 _NAMED_LONG = re.compile(
-    rf"((?:token|key|credentials?){_IS}[\"']?)(?=[\w+/=-]*\d)[\w+/=-]{{20,}}", re.IGNORECASE
+    rf"((?:token|key|credentials?){_IS}[\"']?)(?=[a-z]*\d)[a-z0-9]{{20,}}", re.IGNORECASE
 )
-# The forms of GitHub, GitLab, Hugging Face, OpenAI, AWS and Slack, and JSON web tokens.
+# The forms of GitHub, GitLab, Hugging Face, OpenAI, AWS, Slack and Google, and JSON web tokens.
 _FORMS = re.compile(
     r"\b(?:gh[pousr]_\w{20,}|github_pat_\w{20,}|glpat-[\w-]{20,}|hf_[A-Za-z0-9]{30,}|sk-[\w-]{20,}"
-    r"|AKIA[0-9A-Z]{16}|xox[abprs]-[\w-]{10,}|eyJ[\w-]{10,}\.[\w-]+\.[\w-]+)"
+    r"|AKIA[0-9A-Z]{16}|xox[abprs]-[\w-]{10,}|AIza[\w-]{35}|eyJ[\w-]{10,}\.[\w-]+\.[\w-]+)"
 )
 _PRIVATE_KEY = re.compile(
-    r"(-----BEGIN [A-Z ]*PRIVATE KEY-----).*?(-----END [A-Z ]*PRIVATE KEY-----|\Z)", re.DOTALL
+    r"(-----BEGIN [A-Z ]*PRIVATE KEY-----).*?(-----END [A-Z ]*PRIVATE KEY-----)", re.DOTALL
 )
 
 

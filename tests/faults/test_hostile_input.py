@@ -416,6 +416,7 @@ def test_f35_errors_are_masked_too(tmp_path: Path) -> None:
         ("n_tokens: 5", "n_tokens: 5"),
         ("keys: 5", "keys: 5"),
         ("pad_token: 0", "pad_token: 0"),
+        ("goal_key: observation_of_object_2", "goal_key: observation_of_object_2"),
         ("password:\n  - next", "password:\n  - next"),
         ("password: str | None = None", "password: *** | None = None"),
         ("+key = jax.random.PRNGKey(0)", "+key = jax.random.PRNGKey(0)"),
@@ -504,9 +505,15 @@ def test_no_pickle_is_read_in_the_package() -> None:
 
 
 @pytest.fixture(scope="module")
-def viewed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subprocess.Popen, int]]:
-    """`scilab-rl view last --browser` without a display: the process, and the port of its page."""
-    folder = tmp_path_factory.mktemp("viewed")
+def viewed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
+    """The port of a page that `scilab-rl view` serves."""
+    with viewing(tmp_path_factory.mktemp("viewed")) as (_, port):
+        yield port
+
+
+@contextmanager
+def viewing(folder: Path) -> Iterator[tuple[subprocess.Popen, int]]:
+    """Run `scilab-rl view RUN --browser` without a display; yields it, and its port."""
     episodes = folder / "data" / "2026-01-02" / "run" / "episodes"
     (episodes / "folder").mkdir(parents=True)
     (episodes / "page.npz").touch()
@@ -617,22 +624,18 @@ def slow_client(port: int, request: bytes) -> Iterator[None]:
     ],
 )
 def test_f34_pages_for_this_machine_alone(
-    method: str, path: str, headers: dict[str, str], status: int, viewed: Any
+    method: str, path: str, headers: dict[str, str], status: int, viewed: int
 ) -> None:
-    process, port = viewed
-    assert ask(port, path, headers, method=method).status == status
-    assert process.poll() is None
+    assert ask(viewed, path, headers, method=method).status == status
 
 
-def test_f34_slow_clients_block_nobody_and_end_with_the_server(viewed: Any) -> None:
-    """Last of those that use this server: it is ended here, while it serves a slow client."""
-    process, port = viewed
+def test_f34_slow_clients_block_nobody_and_end_with_the_server(tmp_path: Path) -> None:
     request = b"GET /page.html HTTP/1.0\r\nHost: localhost\r\n\r\n"
-    with slow_client(port, request), slow_client(port, request):
-        assert ask(port, "/page.html", {"Host": "localhost"}).begin.startswith(b"<html>")
-        assert process.poll() is None
-        process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 130
+    with viewing(tmp_path) as (process, port):
+        with slow_client(port, request), slow_client(port, request):
+            assert ask(port, "/page.html", {"Host": "localhost"}).begin.startswith(b"<html>")
+            process.send_signal(signal.SIGINT)
+            assert process.wait(30) == 130
 
 
 READ_LIVE_DATA = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
