@@ -8,7 +8,8 @@ in a virtual environment of their own. Single updates of all algorithms take tur
 and then backwards (A B B A), so that slow changes of the machine's load cancel. Reported are, per
 algorithm and batch size,
 
-* ``ms``: median of the time per update, and ``ratio``: how much longer Stable-Baselines3's takes;
+* ``ms``: median of the time per update; ``ratio``: how much longer Stable-Baselines3's takes, and
+  ``sbx_ratio``: how much longer sbx's;
 * ``cpu_ms`` and ``cpu_ratio``: the same of the processor time, as its lower quartile, which the
   machine's other work disturbs less;
 * ``of_limit``: share of the arithmetic limit that is reached, in processor time. The limit is the
@@ -46,6 +47,7 @@ from scilab_rl.envs.vectorize import make_train_env
 from scilab_rl.workspace import open_desk
 
 PEER = "stable-baselines3"
+SBX = "sbx"
 PRODUCTS = "matrix products"
 PEERS_PYTHON = Path(__file__).parents[1] / ".venv-peers" / "bin" / "python"
 
@@ -75,7 +77,7 @@ ENTRIES = (
     Entry(f"{PEER}, our buffer", ("algorithm=sac",)),
     Entry("cleansac", ("algorithm=cleansac",)),
     Entry("cleansac bfloat16", ("algorithm=cleansac", "algorithm.precision=bfloat16")),
-    Entry("sbx", script="sbx_sac.py"),
+    Entry(SBX, script="sbx_sac.py"),
     Entry("tianshou", script="tianshou_sac.py"),
     # Two at a time, because its actor learns every second time.
     Entry("cleanrl", updates_per_call=2, script="cleanrl_sac.py", only_layers=(256, 256)),
@@ -146,18 +148,25 @@ def measure(
         if entry.overrides and not entry.overrides[0].startswith("algorithm=jax"):
             row |= matrix_products(updates[entry.name], entry.updates_per_call)
         results[entry.name] = row
+    compare(results, entries, gflop(batch_size, net_arch))
+    return results
+
+
+def compare(results: Results, entries: Sequence[Entry], work: float) -> None:
+    """Add to each row what it is relative to the peers and to the limit."""
     if PRODUCTS in results:
         limit = results[PRODUCTS]
-        limit["gflops"] = gflop(batch_size, net_arch) / limit["cpu_ms"] * 1e3
+        limit["gflops"] = work / limit["cpu_ms"] * 1e3
         for entry in entries:
             if entry.has_limit:
                 results[entry.name]["of_limit"] = limit["cpu_ms"] / results[entry.name]["cpu_ms"]
+    for row in results.values() if SBX in results else ():
+        row["sbx_ratio"] = results[SBX]["ms"] / row["ms"]
     for row in results.values() if PEER in results else ():
         row["ratio"] = results[PEER]["ms"] / row["ms"]
         row["cpu_ratio"] = results[PEER]["cpu_ms"] / row["cpu_ms"]
         if "gemm_ms" in row:
             row["limit"] = results[PEER]["cpu_ms"] / row["gemm_ms"]
-    return results
 
 
 def prepare(
@@ -340,8 +349,8 @@ def matrix_products(update: Callable[[], Any], n_updates: int) -> dict[str, floa
 def table(batch_size: int, net_arch: Sequence[int], results: Results) -> str:
     """Return one block of the table."""
     columns = (
-        "ms", "ratio", "cpu_ms", "cpu_ratio", "of_limit", "gemm_ms", "gemm_share", "gflops",
-        "limit",
+        "ms", "ratio", "sbx_ratio", "cpu_ms", "cpu_ratio", "of_limit", "gemm_ms", "gemm_share",
+        "gflops", "limit",
     )  # fmt: skip
     work = gflop(batch_size, net_arch)
     lines = [f"batch {batch_size}, {list(net_arch)}: {work:.3f} GFLOP per update of SAC"]

@@ -118,6 +118,20 @@ def test_arithmetic_of_an_update(benchmarks: Any) -> None:
     assert updates.gflop(2, [3]) * 1e9 == pytest.approx(2 * 2 * (forwards + weights + inputs))
 
 
+def test_rows_are_compared_with_peers_and_with_the_limit(benchmarks: Any) -> None:
+    updates = benchmarks("updates")
+    names = (updates.PEER, updates.SBX, "jaxsac", updates.PRODUCTS)
+    results = {
+        name: {"ms": ms, "cpu_ms": cpu}
+        for name, ms, cpu in zip(names, (24, 12, 6, 3), (20, 16, 5, 4), strict=True)
+    }
+    updates.compare(results, [e for e in updates.ENTRIES if e.name in names], work=0.5)
+    ours = results["jaxsac"]
+    assert (ours["ratio"], ours["sbx_ratio"], ours["cpu_ratio"]) == (4, 2, 4)
+    assert ours["of_limit"] == 0.8
+    assert results[updates.PRODUCTS]["gflops"] == 125  # 0.5 GFLOP in 4 ms
+
+
 def test_turns_go_forwards_and_backwards(benchmarks: Any) -> None:
     order: list[str] = []
     calls = {name: (lambda name=name: order.append(name) or len(order)) for name in "ab"}
