@@ -87,7 +87,7 @@ FILMED = (
     trained("dqn", "CartPole-v1", "q_value,td_error,action", "n_epochs=2",
             "eval_after_n_steps=2000"),
     trained("cleanppo", "CartPole-v1", "value,entropy,action", "n_epochs=2",
-            "eval_after_n_steps=4000", "n_envs=4"),
+            "eval_after_n_steps=4000", "n_envs=4", "algorithm.n_steps=128"),
 )  # fmt: skip
 
 
