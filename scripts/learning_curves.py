@@ -100,7 +100,13 @@ def draw(curves: dict[str, list[Curve]]) -> None:
         need = NEEDS[env_id]
         for curve in of_env:
             thousands = [step / 1000 for step in curve["steps"]]
-            axis.plot(thousands, curve["success"], "o-", ms=3, label=f"{curve['algorithm']}, seed {curve['seed']}")
+            axis.plot(
+                thousands,
+                curve["success"],
+                "o-",
+                ms=3,
+                label=f"{curve['algorithm']}, seed {curve['seed']}",
+            )
         axis.axhline(need.success, color="0.4", ls="--", lw=1)
         limit = f", within {need.steps // 1000}k" if need.steps else ""
         axis.set_title(f"{need.title}\nneeded: {need.success}{limit}", fontsize=9)

@@ -5,7 +5,8 @@ with probability proportional to exp(beta Q(s, a)), where beta, the inverse temp
 us. `scilab-rl export --softmax BETA` writes their trials; from that table alone beta is estimated
 by maximum likelihood, with its standard error from the curvature of the likelihood.
 
-    python scripts/recover_parameters.py            about a minute
+    python scripts/recover_parameters.py                     about a minute
+    python scripts/recover_parameters.py --participants 12   how often the interval is right
 
 The same lines fit the choices of people, once their trials have the columns action, q_0, q_1, ...
 """
@@ -74,23 +75,28 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--folder", type=Path, default=Path("data/recovery"), help="for its files")
     parser.add_argument("--episodes", type=int, default=200, help="of each participant")
+    parser.add_argument("--participants", type=int, default=1, help="for each known beta")
     options = parser.parse_args()
     base = f"base_logdir={options.folder}"
     scilab_rl(*TRAINING, base)
-    for number, beta in enumerate(KNOWN):
-        table = options.folder / f"participant_{number}.csv"
+    n_right = 0
+    participants = [(beta, n) for beta in KNOWN for n in range(options.participants)]
+    for seed, (beta, number) in enumerate(participants, start=1):
+        table = options.folder / f"participant_{beta:g}_{number}.csv"
         scilab_rl(
             "export", "last", "--trials", "--policy=best", f"--softmax={beta}",
-            f"--episodes={options.episodes}", f"--seed={number + 1}", f"--output={table}",
+            f"--episodes={options.episodes}", f"--seed={seed}", f"--output={table}",
             f"--base-logdir={options.folder}",
         )  # fmt: skip
         actions, values = read_trials(table)
         estimate, error = fit_inverse_temperature(actions, values)
+        n_right += abs(estimate - beta) <= 1.96 * error
         sys.stdout.write(
             f"beta {beta:g}: recovered {estimate:.2f} ± {1.96 * error:.2f} from {len(actions)} "
             "choices (95 % interval)\n"
         )
         sys.stdout.flush()
+    sys.stdout.write(f"{n_right} of {len(participants)} intervals contain the known beta\n")
 
 
 if __name__ == "__main__":
