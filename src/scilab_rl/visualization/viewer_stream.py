@@ -80,7 +80,7 @@ class ViewerStream:
         self._curves |= {panel: [] for panel in info.panels if panel not in self._curves}
 
     def add(self, records: Sequence[Record], seconds: Sequence[float]) -> None:
-        """Write scenes; several at once cost little more than one.
+        """Write scenes; several at once cost less than one by one.
 
         Args:
             records: The scenes; of one without a picture, its numbers.
