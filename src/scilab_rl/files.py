@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import json
@@ -52,6 +53,19 @@ def remove_unfinished(directory: Path) -> None:
             shutil.rmtree(abandoned, ignore_errors=True)
         else:
             abandoned.unlink(missing_ok=True)
+
+
+def discard(directory: Path) -> None:
+    """Remove a directory that nobody else uses.
+
+    It is renamed first, so that one that is half removed cannot be taken for a whole one; what a
+    process leaves that is killed meanwhile, `remove_unfinished` removes.
+    """
+    doomed = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
+    with contextlib.suppress(OSError):
+        directory.rename(doomed)
+        crash_point("files.in_discarding")
+    shutil.rmtree(doomed, ignore_errors=True)
 
 
 def atomic_write(path: Path, write: Callable[[IO[bytes]], object]) -> None:

@@ -186,9 +186,9 @@ def _swap(finished: Path, directory: Path) -> None:
     """
     previous = _previous(directory)
     if directory.exists():
-        shutil.rmtree(previous, ignore_errors=True)
+        files.discard(previous)
         directory.rename(previous)
     files.crash_point("checkpoint.in_swap")
     finished.rename(directory)
     files.fsync_directory(directory.parent)
-    shutil.rmtree(previous, ignore_errors=True)
+    files.discard(previous)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import copy
 import logging
-import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.vectorize import observed_layer
 from scilab_rl.errors import CheckpointError
-from scilab_rl.files import crash_point, point_to, remove_unfinished
+from scilab_rl.files import crash_point, discard, point_to, remove_unfinished
 from scilab_rl.training import checkpoint
 from scilab_rl.training.snapshot import Snapshot, capture, random_state, restore, set_random_state
 
@@ -99,7 +98,7 @@ def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
     point_to(folder / LAST, directory)
     crash_point("checkpoint.before_forgetting")
     for old in _generations(run_dir)[GENERATIONS:]:
-        shutil.rmtree(old, ignore_errors=True)
+        discard(old)
     return directory
 
 
