@@ -40,6 +40,7 @@ class Benchmark(NamedTuple):
 BENCHMARKS = {
     "startup": Benchmark(("startup.py",), "--help and the first step", 2),
     "updates": Benchmark(("updates.py",), "updates per second beside the peers'", 6),
+    "steps": Benchmark(("steps.py",), "steps per second beside the peers'", 8),
     "replay": Benchmark(("replay.py",), "hindsight replay: speed and memory", 6),
     "checkpoint": Benchmark(("checkpoint_1m.py",), "saving a replay buffer of 1M", 2),
     "environments": Benchmark(("environments.py",), "our environments beside the originals", 5),

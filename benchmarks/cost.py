@@ -18,21 +18,17 @@ Run: python benchmarks/cost.py [--rounds N] [--steps N] [--json FILE] [KEY=VALUE
 from __future__ import annotations
 
 import argparse
-import multiprocessing
 import statistics
 import tempfile
-import threading
-from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from participants import Run
 from turns import Seconds, publish, relative, take_turns
 
 BASE = "nothing"
 EVALUATION = "evaluation"
-PATIENCE_SECONDS = 120.0
 PROBES = "[q_value,critic_variance,goal_distance,reward]"
 _FEW_EPISODES = ("n_test_rollouts=1",)
 VARIANTS = {
@@ -57,7 +53,9 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
     parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="for every run")
     arguments = parser.parse_intermixed_args()
-    given = (f"eval_after_n_steps={arguments.steps}", *arguments.overrides)
+    given = (
+        "algorithm=jaxsac", f"eval_after_n_steps={arguments.steps}", *arguments.overrides,
+    )  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:
         runs = {
             name: Run((*words, *given, f"base_logdir={folder}/{index}"))
@@ -86,111 +84,6 @@ def compare(taken: list[Seconds], base: list[Seconds], n_steps: int) -> dict[str
         "cpu_ratio": cpu["ratio"],
         "cpu_interval": cpu["interval"],
     }
-
-
-class Run:
-    """A run in a process of its own, which learns for an epoch whenever it is told to.
-
-    Args:
-        overrides: Of the configuration.
-    """
-
-    def __init__(self, overrides: Sequence[str]) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, theirs = context.Pipe()
-        self._process = context.Process(target=learn_in_turns, args=(theirs, overrides))
-        self._process.start()
-        theirs.close()
-        self._connection.recv()  # it is ready
-
-    def epoch(self, *, with_evaluation: bool = False) -> Seconds:
-        """Let it learn for an epoch."""
-        self._connection.send(True)
-        seconds, evaluation = self._connection.recv()
-        return seconds if with_evaluation else seconds - evaluation
-
-    def end(self) -> None:
-        """Let it end."""
-        self._connection.send(False)
-        self._process.join()
-
-
-def learn_in_turns(connection: Connection, overrides: Sequence[str]) -> None:
-    """Train, and wait for permission before each epoch."""
-    import hydra
-
-    from scilab_rl import config, experiment
-    from scilab_rl.training import trainer
-
-    watcher = Watcher(connection, trainer.evaluate)
-    trainer.evaluate = watcher.evaluate
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        cfg = config.compose(
-            [
-                "algorithm=jaxsac", "env=FetchReach-v4", "seed=1", "n_epochs=1000000",
-                "early_stop_threshold=2", "mlflow=0", "++tracking.console.enabled=false",
-                *overrides,
-            ]
-        )  # fmt: skip
-        experiment.run(cfg, watch=watcher.watch)
-
-
-class Watcher:
-    """Lets a run wait between its epochs, and tells how long they take.
-
-    Args:
-        connection: To the benchmark.
-        evaluate: What evaluates the policy.
-    """
-
-    def __init__(self, connection: Connection, evaluate: Callable[..., Any]) -> None:
-        self._connection = connection
-        self._evaluate = evaluate
-        self._begun = self._evaluation = Seconds(0.0, 0.0)
-        self._trackers: list[Any] = []
-        self._written = threading.Semaphore(0)
-
-    def watch(self, session: Any) -> None:
-        """Attach to a run that is about to begin."""
-        from scilab_rl.tracking.mirror import Mirror
-
-        self._trackers = [t for t in session.trackers.trackers if isinstance(t, Mirror)]
-        for mirror in self._trackers:
-            mirror.tracker.epoch = followed_by(self._written.release, mirror.tracker.epoch)
-        session.trainer.may_go_on.append(self.end_epoch)
-        self._connection.send("ready")
-        self.wait()
-
-    def evaluate(self, *arguments: Any) -> Any:
-        """Evaluate, and note how long it takes."""
-        started = Seconds.now()
-        outcome = self._evaluate(*arguments)
-        self._evaluation = Seconds.now() - started
-        return outcome
-
-    def end_epoch(self, _step: int, _epoch: int, _values: Mapping[str, float]) -> bool:
-        """Report, and wait for the next turn."""
-        for tracker in self._trackers:
-            if not self._written.acquire(timeout=PATIENCE_SECONDS):
-                raise SystemExit(f"{tracker.label} does not write what it is told.")
-        self._connection.send((Seconds.now() - self._begun, self._evaluation))
-        return self.wait()
-
-    def wait(self) -> bool:
-        """Wait for the turn, and return whether there is one."""
-        go_on = self._connection.recv()
-        self._begun = Seconds.now()
-        return go_on
-
-
-def followed_by(tell: Callable[[], object], call: Callable[..., object]) -> Callable[..., None]:
-    """Return a call that tells when it is done."""
-
-    def call_and_tell(*arguments: Any) -> None:
-        call(*arguments)
-        tell()
-
-    return call_and_tell
 
 
 def table(rows: Rows) -> str:

@@ -7,7 +7,8 @@ included. The peer has the values that RL Baselines3 Zoo and the paper's authors
 
 Prints a table with medians over the seeds and one JSON object with every run and its curve.
 
-Run: python benchmarks/time_to_success.py reach|push|pick|slide [--seeds N] [--only NAME ...]
+Run: python benchmarks/time_to_success.py reach|push|pick|slide [--seeds N] [--first-seed N]
+[--only NAME ...]
 """
 
 from __future__ import annotations
@@ -61,7 +62,8 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("task", choices=TASKS)
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--seeds", type=int, default=3, help="how many; default 3")
+    parser.add_argument("--first-seed", type=int, default=1)
     parser.add_argument("--only", nargs="*", help="names of recipes")
     parser.add_argument("--logdir", type=Path, help="keep the runs in this folder")
     parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
@@ -71,7 +73,7 @@ def main() -> None:
     names = [name for name in task.recipes if not arguments.only or name in arguments.only]
     runs: dict[str, list[dict[str, Any]]] = {name: [] for name in names}
     with tempfile.TemporaryDirectory() as scratch:
-        for seed in range(1, arguments.seeds + 1):
+        for seed in range(arguments.first_seed, arguments.first_seed + arguments.seeds):
             for name in names:
                 folder = (arguments.logdir or Path(scratch)) / f"{name.split()[0]}-{seed}"
                 overrides = (*task.recipes[name], *arguments.overrides)

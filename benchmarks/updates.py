@@ -26,9 +26,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
@@ -39,6 +36,7 @@ from typing import Any, NamedTuple
 import hydra
 import numpy as np
 import torch
+from participants import Peer, peers_are_installed
 from torch.profiler import ProfilerActivity, profile
 from turns import publish, take_turns, timed
 
@@ -49,7 +47,6 @@ from scilab_rl.workspace import open_desk
 PEER = "stable-baselines3"
 SBX = "sbx"
 PRODUCTS = "matrix products"
-PEERS_PYTHON = Path(__file__).parents[1] / ".venv-peers" / "bin" / "python"
 
 
 class Entry(NamedTuple):
@@ -110,8 +107,7 @@ def main() -> None:
     arguments = parser.parse_args()
     open_desk()
     entries = [entry for entry in ENTRIES if not arguments.only or entry.name in arguments.only]
-    if not PEERS_PYTHON.exists():
-        sys.stdout.write("Some peers are missing: `make .venv-peers/.installed` installs them.\n")
+    if not peers_are_installed():
         entries = [entry for entry in entries if entry.script is None]
     torch.set_num_threads(arguments.threads)
     steps = recorded_steps(arguments.steps)
@@ -209,30 +205,11 @@ def configure(*overrides: str) -> Any:
 def peer_process(
     entry: Entry, batch_size: int, net_arch: tuple[int, ...], steps: list[Step]
 ) -> Callable[[], float]:
-    """Start a peer in its own virtual environment, and return what makes it do its updates.
-
-    The function returns the seconds of processor time that the peer took.
-    """
-    script = Path(__file__).parent / "peers" / str(entry.script)
+    """Start a peer, and return what makes it do its updates."""
     with written(steps) as path:
-        process = subprocess.Popen(
-            list(map(str, [PEERS_PYTHON, script, path, batch_size, *net_arch])),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-            env=os.environ | {"OMP_NUM_THREADS": str(torch.get_num_threads())},
-        )
-        assert process.stdin is not None and process.stdout is not None
-        requests, answers = process.stdin, process.stdout
-        if not answers.readline():  # it would be ready
-            raise SystemExit(f"{script} has failed, see above.")
-
-    def update() -> float:
-        requests.write(f"{entry.updates_per_call}\n")
-        requests.flush()
-        return float(answers.readline())
-
-    return update
+        words = (path, batch_size, *net_arch)
+        peer = Peer(str(entry.script), *words, n_threads=torch.get_num_threads())
+    return partial(peer.do, entry.updates_per_call)
 
 
 @contextlib.contextmanager

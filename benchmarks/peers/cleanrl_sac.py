@@ -1,12 +1,13 @@
-"""Does steps of CleanRL's SAC, as `benchmarks/updates.py` asks.
+"""Does steps of CleanRL's SAC, as the benchmarks ask; see `recorded`.
 
 CleanRL is a script, `cleanrl/sac_continuous_action.py`, and runs here as it was published. In place
-of the old Gym it gets an environment that repeats recorded steps and then costs nothing, and in
-whose `step` it waits for requests. So a request takes the script once around its loop: an update,
-the choice of one action, and one transition stored. It has no hindsight and no other layers than
-[256, 256]; its actor learns every second time, twice.
+of the old Gym it gets an environment in whose `step` it waits for requests: FetchReach with its
+goal in the observation, or one that repeats recorded steps and then costs nothing. So a request
+takes the script once around its loop: an update, the choice of one action, and one transition
+stored. It has no hindsight and no other layers than [256, 256]; its actor learns every second time,
+twice.
 
-Runs in the peers' virtual environment: cleanrl_sac.py STEPS BATCH_SIZE
+Runs in the peers' virtual environment: cleanrl_sac.py STEPS|live BATCH_SIZE
 """
 
 import os
@@ -17,9 +18,13 @@ from collections.abc import Iterator
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import gymnasium
+import gymnasium_robotics
 import numpy as np
 from gymnasium import spaces
 from recorded import Requests, Step, given, read_steps
+
+N_RANDOM = 100  # steps before the first update of a run that takes its own
 
 
 class RecordedActions(spaces.Box):
@@ -67,6 +72,33 @@ class WaitingEnv:
         sys.exit()
 
 
+class LiveEnv:
+    """Gym's vector environment with FetchReach, which waits when it has stepped often enough."""
+
+    num_envs = 1
+
+    def __init__(self, env: gymnasium.Env, requests: Requests) -> None:
+        self._env, self._requests = env, requests
+        self._n_left = N_RANDOM
+        self.single_observation_space = spaces.Box(-np.inf, np.inf, self.reset().shape[1:])
+        self.single_action_space = env.action_space
+        self.action_space = spaces.Box(-1.0, 1.0, (1, *env.action_space.shape), np.float32)
+
+    def reset(self) -> np.ndarray:
+        """Begin an episode."""
+        return flat(self._env.reset()[0])[None]
+
+    def step(self, actions: np.ndarray) -> tuple[Any, ...]:
+        """Take a step, and begin the next episode where one ends."""
+        while not self._n_left:
+            self._n_left = self._requests.next() or sys.exit()
+        self._n_left -= 1
+        observation, reward, _, over, _ = self._env.step(actions[0])
+        info = {"TimeLimit.truncated": over, "terminal_observation": flat(observation)}
+        after = self.reset() if over else flat(observation)[None]
+        return after, np.array([reward]), np.array([over]), [info]
+
+
 def flat(observation: dict[str, np.ndarray]) -> np.ndarray:
     """Return the entries of an observation as one vector."""
     return np.concatenate(list(observation.values())).astype(np.float32)
@@ -76,13 +108,19 @@ def main() -> None:
     """Run the script with these steps."""
     requests = Requests()
     path, batch_size, _ = given()
-    steps = list(read_steps(path))
+    if path is None:
+        gymnasium.register_envs(gymnasium_robotics)
+        env: Any = LiveEnv(gymnasium.make("FetchReach-v4"), requests)
+        n_random = N_RANDOM
+    else:
+        steps = list(read_steps(path))
+        env, n_random = WaitingEnv(steps, requests), len(steps)
     gym: Any = ModuleType("gym")
     gym.spaces = spaces
-    gym.vector = SimpleNamespace(SyncVectorEnv=lambda _makers: WaitingEnv(steps, requests))
+    gym.vector = SimpleNamespace(SyncVectorEnv=lambda _makers: env)
     sys.modules["gym"] = gym
     sys.argv = [
-        "sac_continuous_action.py", "--learning-starts", str(len(steps)),
+        "sac_continuous_action.py", "--learning-starts", str(n_random),
         "--batch-size", str(batch_size), "--cuda", "False",
     ]  # fmt: skip
     with tempfile.TemporaryDirectory() as folder:  # it writes files for TensorBoard

@@ -1,7 +1,9 @@
-"""What the peers share: steps that were recorded for all, and updates on request.
+"""What the peers share: steps that were recorded for all, and work on request.
 
-A peer reads the number of updates from standard input, does them, and answers with the seconds of
-processor time that they took. What a library prints is thrown away.
+A peer is given a file of recorded steps, and does updates on them; or the word ``live``, and takes
+steps of its own in FetchReach, with an update after each. It reads how many from standard input,
+does them, and answers with the seconds of processor time that they took. What a library prints is
+thrown away.
 """
 
 import os
@@ -14,6 +16,7 @@ from typing import NamedTuple, TextIO
 import numpy as np
 
 HORIZON = 50  # steps of an episode of Fetch
+LIVE = "live"
 
 
 class Step(NamedTuple):
@@ -39,14 +42,14 @@ def read_steps(path: str) -> Iterator[Step]:
         yield Step(now, following, action, float(reward), bool(over))
 
 
-def given() -> tuple[str, int, list[int]]:
-    """Return the file of the steps, the batch size and the sizes of the hidden layers."""
+def given() -> tuple[str | None, int, list[int]]:
+    """Return the file of the steps if any, the batch size and the sizes of the hidden layers."""
     path, batch_size, *net_arch = sys.argv[1:]
-    return path, int(batch_size), list(map(int, net_arch))
+    return None if path == LIVE else path, int(batch_size), list(map(int, net_arch))
 
 
 class Requests:
-    """Asked for updates by the benchmark. To be made before anything can print."""
+    """Asked for work by the benchmark. To be made before anything can print."""
 
     def __init__(self) -> None:
         self._answers: TextIO = os.fdopen(os.dup(sys.stdout.fileno()), "w", buffering=1)
@@ -54,13 +57,13 @@ class Requests:
         self._started = 0.0
 
     def next(self) -> int:
-        """Tell that the last work is done, and return how many updates come next; 0: no more."""
+        """Tell that the last work is done, and return how much comes next; 0: no more."""
         self._answers.write(f"{time.process_time() - self._started}\n")
         request = sys.stdin.readline()
         self._started = time.process_time()
         return int(request or 0)
 
-    def serve(self, update: Callable[[int], object]) -> None:
-        """Do as many updates as are asked for, until nobody asks any more."""
-        while n_updates := self.next():
-            update(n_updates)
+    def serve(self, work: Callable[[int], object]) -> None:
+        """Do as much as is asked for, until nobody asks any more."""
+        while n := self.next():
+            work(n)

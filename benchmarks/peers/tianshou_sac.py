@@ -1,6 +1,6 @@
-"""Does updates of Tianshou's SAC with hindsight replay, as `benchmarks/updates.py` asks.
+"""Does the work of Tianshou's SAC with hindsight replay on FetchReach, see `recorded`.
 
-Runs in the peers' virtual environment: tianshou_sac.py STEPS BATCH_SIZE LAYER ...
+Runs in the peers' virtual environment: tianshou_sac.py STEPS|live BATCH_SIZE LAYER ...
 """
 
 from collections.abc import Sequence
@@ -15,12 +15,13 @@ from tianshou.algorithm import SAC
 from tianshou.algorithm.algorithm_base import policy_within_training_step
 from tianshou.algorithm.modelfree.sac import AutoAlpha, SACPolicy
 from tianshou.algorithm.optim import AdamOptimizerFactory
-from tianshou.data import Batch, HERReplayBuffer
+from tianshou.data import Batch, Collector, HERReplayBuffer
 from tianshou.utils.net.common import Net, get_dict_state_decorator
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
 
 BUFFER_SIZE = 1_000_000
 LEARNING_RATE = 3e-4
+N_RANDOM = 100  # steps before the first update
 # One of five episodes keeps its goal, as with four relabelled transitions per original one.
 FUTURE_K = 5
 
@@ -40,6 +41,9 @@ def main() -> None:
         horizon=HORIZON,
         future_k=FUTURE_K,
     )
+    if path is None:
+        learn_live(algorithm, buffer, env, batch_size, requests)
+        return
     for step in read_steps(path):
         buffer.add(
             Batch(
@@ -59,6 +63,23 @@ def main() -> None:
                 algorithm.update(buffer, batch_size)
 
     requests.serve(update)
+
+
+def learn_live(
+    algorithm: SAC, buffer: HERReplayBuffer, env: Any, batch_size: int, requests: Requests
+) -> None:
+    """Step and update in turns, as Tianshou's trainer does it."""
+    collector = Collector(algorithm, env, buffer)
+    collector.reset()
+    with policy_within_training_step(algorithm.policy):
+        collector.collect(n_step=N_RANDOM, random=True)
+
+        def learn(n_steps: int) -> None:
+            for _ in range(n_steps):
+                collector.collect(n_step=1)
+                algorithm.update(buffer, batch_size)
+
+        requests.serve(learn)
 
 
 def make_sac(env: Any, net_arch: Sequence[int]) -> SAC:

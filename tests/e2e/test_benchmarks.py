@@ -36,6 +36,10 @@ SMALLEST = {
         ["updates.py", "--rounds", "1", "--sizes", "32,16", "--steps", "150"],
         "batch 32, [16]",
     ),
+    "steps": (
+        ["steps.py", "--rounds", "1", "--steps", "120", "--only", "stable-baselines3", "jaxsac"],
+        "jaxsac",
+    ),
     "replay": (["replay.py", "--transitions", "4000"], "ours"),
     "checkpoint": (["checkpoint_1m.py", "--transitions", "1000"], "save_seconds"),
     "environments": (["environments.py", "--steps", "1"], 0),
@@ -70,7 +74,7 @@ def benchmarks(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_runs_in_its_smallest_size(name: str, tmp_path: Path, benchmarks: Any) -> None:
     if name == "showing":
         pytest.importorskip("rerun")
-    if name in ("startup", "updates", "scaling", "cost"):
+    if name in ("startup", "updates", "steps", "scaling", "cost"):
         pytest.importorskip("jax")
     if name == "cost":
         pytest.importorskip("mlflow")
@@ -103,7 +107,7 @@ def test_each_script_has_a_name_and_each_name_a_smallest_size(benchmarks: Any) -
     named = {benchmark.words[0] for benchmark in benchmarks("all").BENCHMARKS.values()}
     scripts = {path.name for path in BENCHMARKS.glob("*.py")}
     # `gates.py` simulates statistics and draws a figure; it measures nothing.
-    assert named == scripts - {"all.py", "turns.py", "gates.py"}
+    assert named == scripts - {"all.py", "turns.py", "participants.py", "gates.py"}
     run_here = {benchmarks("all").BENCHMARKS[name].words[0] for name in SMALLEST}
     assert run_here == named
 
