@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import atexit
-import contextlib
 import dataclasses
 import getpass
 import importlib.util
@@ -41,6 +40,17 @@ _TOGETHER = 32  # scenes in one delivery
 _PATIENCE = 2.0  # seconds for what is waiting at the end
 _MEMORY = "512MiB"  # of the server; the oldest scenes go first
 _STOP = object()
+# Keeps the page from outliving a program that is killed: its own death closes the pipe.
+_GUARD = """
+import subprocess, sys
+page = subprocess.Popen(sys.argv[1:], stdin=subprocess.DEVNULL)
+sys.stdin.read()
+page.terminate()
+try:
+    page.wait(2)
+except subprocess.TimeoutExpired:
+    page.kill()
+"""
 
 
 class LiveViewer:
@@ -110,7 +120,7 @@ class LiveViewer:
         self._thread.join(_PATIENCE)
         if self._thread.is_alive():  # the viewer is stuck, and the package would wait for it
             atexit.unregister(self._rerun.rerun_shutdown)
-        _end_child(self._page)
+        _end_page(self._page)
         _log.info(
             "The live view has ended; a window or page that is open keeps what it has shown. "
             "To keep episodes in files: render=record, or scilab-rl play last --record."
@@ -214,7 +224,7 @@ def serve_data(panels: tuple[str, ...], host: str) -> tuple[Any, str, int]:
 
 
 def serve_page(source: str, host: str, page_port: int) -> subprocess.Popen[bytes]:
-    """Start the web viewer's server as a child process.
+    """Start the web viewer's server, which ends when the pipe to its guard is closed.
 
     Args:
         source: Address of a data server, or path of a recording.
@@ -222,7 +232,8 @@ def serve_page(source: str, host: str, page_port: int) -> subprocess.Popen[bytes
         page_port: Port of the page.
     """
     options = ["--serve-web", "--bind", host, "--web-viewer-port", str(page_port)]
-    return start_viewer([source, *options, "--port", "0"], subprocess.DEVNULL)
+    guard = (sys.executable, "-I", "-S", "-c", _GUARD)
+    return start_viewer([source, *options, "--port", "0"], subprocess.DEVNULL, guard)
 
 
 def page_address(uri: str, host: str, page_port: int) -> str:
@@ -261,12 +272,20 @@ def has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def start_viewer(arguments: list[str], stderr: int | IO[bytes]) -> subprocess.Popen[bytes]:
-    """Start the viewer's program, with its collection of usage data switched off."""
+def start_viewer(
+    arguments: list[str], stderr: int | IO[bytes], guard: tuple[str, ...] = ()
+) -> subprocess.Popen[bytes]:
+    """Start the viewer's program, with its collection of usage data switched off.
+
+    Args:
+        arguments: Of the program.
+        stderr: Where it complains.
+        guard: What starts it and reads from a pipe of ours; nothing: it is our own child.
+    """
     return subprocess.Popen(
-        [str(_program()), *arguments],
+        [*guard, str(_program()), *arguments],
         env=os.environ | {"XDG_CONFIG_HOME": _quiet_configuration()},
-        stdin=subprocess.DEVNULL,
+        stdin=subprocess.PIPE if guard else subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=stderr,
         start_new_session=True,  # Ctrl-C is for the training
@@ -295,12 +314,8 @@ def _quiet_configuration() -> str:
     return str(folder)
 
 
-def _end_child(child: subprocess.Popen[bytes] | None) -> None:
-    if child is None or child.poll() is not None:
-        return
-    child.terminate()
-    with contextlib.suppress(subprocess.TimeoutExpired):
-        child.wait(3)
-        return
-    child.kill()
-    child.wait()
+def _end_page(guard: subprocess.Popen[bytes] | None) -> None:
+    if guard is not None:
+        assert guard.stdin is not None
+        guard.stdin.close()
+        guard.wait()

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import socket
+import subprocess
+import sys
 import time
 import urllib.request
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 
 import psutil
 import pytest
@@ -18,6 +19,14 @@ from scilab_rl.visualization.records import Record
 from .clips import make_clip
 
 pytest.importorskip("rerun")
+
+
+SHOWING = """
+import time
+from scilab_rl.visualization.live import LiveViewer
+print(LiveViewer((), window=False)._page.pid, flush=True)
+time.sleep(60)
+"""
 
 
 @pytest.fixture
@@ -45,6 +54,13 @@ def listening_addresses(*processes: psutil.Process) -> set[str]:
     }
 
 
+def wait_for(find: Callable[[], list[psutil.Process]]) -> list[psutil.Process]:
+    deadline = time.monotonic() + 20
+    while not (found := find()) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return found
+
+
 def wait_for_page(viewer: LiveViewer) -> None:
     deadline = time.monotonic() + 20
     assert viewer.address is not None
@@ -58,31 +74,53 @@ def wait_for_page(viewer: LiveViewer) -> None:
     pytest.fail("the page is not served")
 
 
-def test_page_is_served_to_this_machine_only(viewer: LiveViewer) -> None:
+def page_of(viewer: LiveViewer) -> psutil.Process:
+    """Return the page's server, the only child of its guard."""
     wait_for_page(viewer)
-    show(viewer, 2)
     assert viewer._page is not None
-    child = psutil.Process(viewer._page.pid)
-    assert listening_addresses(psutil.Process(), child) == {"127.0.0.1"}
+    (server,) = psutil.Process(viewer._page.pid).children()
+    return server
+
+
+def test_page_is_served_to_this_machine_only(viewer: LiveViewer) -> None:
+    server = page_of(viewer)
+    show(viewer, 2)
+    assert listening_addresses(psutil.Process(), server) == {"127.0.0.1"}
 
 
 def test_child_ends_with_the_view() -> None:
     viewer = LiveViewer(("reward",), window=False)
     assert viewer._page is not None
-    pid = viewer._page.pid
-    assert psutil.pid_exists(pid)
+    server, guard = page_of(viewer), psutil.Process(viewer._page.pid)
     viewer.close()
-    assert not psutil.pid_exists(pid)
+    assert not server.is_running()
+    assert not guard.is_running()
+
+
+@pytest.mark.parametrize("is_stuck", [False, True])
+def test_page_ends_with_a_program_that_is_killed(tmp_path: Path, is_stuck: bool) -> None:
+    program = subprocess.Popen(
+        [sys.executable, "-c", SHOWING], stdout=subprocess.PIPE, text=True, cwd=tmp_path
+    )
+    assert program.stdout is not None
+    guard = psutil.Process(int(program.stdout.readline()))
+    (server,) = wait_for(guard.children)
+    if is_stuck:
+        server.suspend()
+    program.kill()
+    program.wait()
+    program.stdout.close()
+    _, alive = psutil.wait_procs([server, guard], timeout=20)
+    assert not alive
 
 
 def test_stopped_and_killed_pages_stop_nobody(viewer: LiveViewer) -> None:
-    wait_for_page(viewer)
-    assert viewer._page is not None
-    os.kill(viewer._page.pid, signal.SIGSTOP)
+    server = page_of(viewer)
+    server.suspend()
     started = time.monotonic()
     show(viewer, 100)
     assert time.monotonic() - started < 2.0
-    os.kill(viewer._page.pid, signal.SIGKILL)
+    server.kill()
     show(viewer, 1)
 
 
