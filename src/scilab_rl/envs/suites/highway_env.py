@@ -6,7 +6,26 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from highway_env.envs.common.observation import KinematicsGoalObservation
 from highway_env.envs.parking_env import ParkingEnv
+
+
+class GoalObservation(KinematicsGoalObservation):
+    """The car and its goal as numbers, without the tables of pandas in between.
+
+    They took nine tenths of a step, in which there are four observations.
+    """
+
+    def observe(self) -> dict[str, np.ndarray]:
+        """Return what the original returns, to the last bit."""
+        car = self.observer_vehicle
+        if not car:
+            return super().observe()
+        now, goal = (
+            np.array([known[feature] for feature in self.features], dtype=np.float64) / self.scales
+            for known in (car.to_dict(), car.goal.to_dict())
+        )
+        return {"observation": now, "achieved_goal": now.copy(), "desired_goal": goal}
 
 
 class Parking(ParkingEnv):
@@ -14,6 +33,13 @@ class Parking(ParkingEnv):
 
     The original adds the cost of a collision in `step` alone, and has no ``compute_terminated``.
     """
+
+    def define_spaces(self) -> None:
+        """Set spaces and observations as the original does, the latter in our quick form."""
+        super().define_spaces()
+        self.observation_type_parking = GoalObservation(self, **self.PARKING_OBS["observation"])
+        if type(self.observation_type) is KinematicsGoalObservation:
+            self.observation_type = GoalObservation(self, **self.config["observation"])
 
     def compute_reward(
         self, achieved_goal: Any, desired_goal: Any, info: Any, p: float = 0.5
