@@ -11,6 +11,7 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
@@ -224,3 +225,34 @@ def test_the_script_of_cleanrl_waits_after_the_recorded_steps(benchmarks: Any) -
     env.step(None)
     with pytest.raises(SystemExit):
         env.step(None)
+
+
+def test_the_script_of_cleanrl_takes_as_many_steps_as_it_is_asked_for(benchmarks: Any) -> None:
+    """The first ones are random and for nobody; episodes follow each other."""
+    cleanrl = benchmarks("cleanrl_sac")
+    taken: list[float] = []
+
+    class TwoSteps(gym.Env):
+        action_space = gym.spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+        def reset(self, **_: Any) -> tuple[dict[str, np.ndarray], dict]:
+            self.n_steps = 0
+            return {"observation": np.array([100.0])}, {}
+
+        def step(self, action: np.ndarray) -> tuple[Any, ...]:
+            taken.append(action.item())
+            self.n_steps += 1
+            return {"observation": np.array([self.n_steps])}, -1.0, False, self.n_steps == 2, {}
+
+    asked = iter([3, 0])
+    env = cleanrl.LiveEnv(TwoSteps(), SimpleNamespace(next=lambda: next(asked)))
+    for number in range(cleanrl.N_RANDOM + 3):
+        after, _, dones, infos = env.step(np.array([[float(number)]]))
+        is_last = number % 2 == 1
+        assert after.item() == (100.0 if is_last else 1.0)
+        assert dones[0] == infos[0]["TimeLimit.truncated"] == is_last
+        assert infos[0]["terminal_observation"].item() == (2.0 if is_last else 1.0)
+    assert len(taken) == cleanrl.N_RANDOM + 3
+    with pytest.raises(SystemExit):
+        env.step(np.array([[0.0]]))
+    assert len(taken) == cleanrl.N_RANDOM + 3
