@@ -1,10 +1,11 @@
 """Compare the pinned versions with known vulnerabilities: a list of ours, and pip-audit if it can.
 
 The list (``scripts/advisories.csv``) holds advisories of packages that we or our dependencies use.
-It was written down from memory, without a database at hand, at the date in its first line: it is
-not complete, an entry may be wrong, and it does not grow by itself. It catches a pin that goes back
-to a version that we know as vulnerable, also without a network. pip-audit asks PyPI for all
-packages; what it could not look up is said, and never counts as good.
+Its column ``checked`` says whether a row was compared with public threads or only written from
+memory, at the date in its first line: it is not complete, an entry may be wrong, and it does not
+grow by itself. It catches a pin that goes back to a version that we know as vulnerable, also
+without a network. pip-audit asks PyPI for all packages; what it could not look up is said, and
+never counts as good.
 
 Run: python scripts/audit.py [--offline]
 """
@@ -31,8 +32,8 @@ def pins(path: Path) -> dict[str, Version]:
     return {re.sub(r"[-_.]+", "-", name).lower(): Version(version) for name, version in found}
 
 
-def known_problems(pinned: dict[str, Version]) -> tuple[list[str], int]:
-    """Return a line for each pin below the version that repairs it, and how many were compared."""
+def known_problems(pinned: dict[str, Version]) -> tuple[list[str], int, int]:
+    """Return a line for each vulnerable pin, how many rows were compared, and how many checked."""
     lines = _ADVISORIES.read_text(encoding="utf-8").splitlines()
     rows = list(csv.DictReader(line for line in lines if not line.startswith("#")))
     compared = [row for row in rows if row["package"] in pinned]
@@ -42,7 +43,7 @@ def known_problems(pinned: dict[str, Version]) -> tuple[list[str], int]:
         for row in compared
         if pinned[row["package"]] < Version(row["repaired"])
     ]
-    return problems, len(compared)
+    return problems, len(compared), sum(row["checked"] == "yes" for row in compared)
 
 
 def ask_pip_audit(path: Path) -> tuple[list[str], str]:
@@ -68,10 +69,11 @@ def ask_pip_audit(path: Path) -> tuple[list[str], str]:
 def main() -> int:
     """Print the report; 1 if a pin is known as vulnerable."""
     constraints = _ROOT / "constraints.txt"
-    problems, n_compared = known_problems(pins(constraints))
+    problems, n_compared, n_checked = known_problems(pins(constraints))
     told = (
-        f"{n_compared} advisories of the list concern pinned packages. The list was written from "
-        "memory and is not complete: check an entry before relying on it."
+        f"{n_compared} advisories of the list concern pinned packages: {n_checked} were checked "
+        f"against public threads, {n_compared - n_checked} only written from memory. The list is "
+        "not complete."
     )
     if "--offline" not in sys.argv:
         found, asked = ask_pip_audit(constraints)
