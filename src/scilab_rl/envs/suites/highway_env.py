@@ -38,7 +38,7 @@ class Parking(ParkingEnv):
         """Set spaces and observations as the original does, the latter in our quick form."""
         super().define_spaces()
         self.observation_type_parking = GoalObservation(self, **self.PARKING_OBS["observation"])
-        if type(self.observation_type) is KinematicsGoalObservation:
+        if self.config["observation"]["type"] == "KinematicsGoal":
             self.observation_type = GoalObservation(self, **self.config["observation"])
 
     def compute_reward(
