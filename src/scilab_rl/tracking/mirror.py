@@ -13,6 +13,9 @@ from scilab_rl.results import RunResult
 from scilab_rl.tracking.base import RunInfo, SyncableTracker, Tracker
 
 _log = logging.getLogger(__name__)
+_LOOK_SECONDS = 0.5
+_AT_WORK = 0.01  # share of a processor above which a tracker does not hang
+_MOST_PATIENCE = 10  # times the patience, whatever it works at
 
 
 class Mirror(Tracker):
@@ -26,7 +29,8 @@ class Mirror(Tracker):
         label: Its name in the warning.
         queue_size: Most waiting messages; further ones are dropped.
         max_failures: Failures in a row until it is switched off.
-        patience_seconds: How long the end of a run waits for the queue to empty.
+        patience_seconds: How long the end of a run waits for a tracker that does nothing. One that
+            is at work, as many are that start at the same time, gets ten times as much.
     """
 
     def __init__(
@@ -47,6 +51,7 @@ class Mirror(Tracker):
         self._failures = 0
         self._off = False
         self._closing: Callable[[], object] | None = None
+        self._clock: int | None = None  # of the thread's processor time
 
     def begin(self, run: RunInfo) -> None:
         """Start the thread; the tracker itself is opened there."""
@@ -68,9 +73,28 @@ class Mirror(Tracker):
         deadline = time.monotonic() + self.patience_seconds
         for message in (self._closing, None):
             self._put(message, max(0.0, deadline - time.monotonic()))
-        self._thread.join(max(0.0, deadline - time.monotonic()))
+        waited = self._wait()
         if self._thread.is_alive():
-            self._switch_off(f"it did not finish within {self.patience_seconds:g} s")
+            self._switch_off(f"it did not finish within {round(waited, 1):g} s")
+
+    def _wait(self) -> float:
+        """Wait for the thread to end, unless it hangs; return the seconds that it took."""
+        started = now = time.monotonic()
+        latest = started + _MOST_PATIENCE * self.patience_seconds
+        end, worked = started + self.patience_seconds, self._processor_seconds()
+        while self._thread.is_alive() and now < min(end, latest):
+            self._thread.join(min(_LOOK_SECONDS, end - now))
+            now = time.monotonic()
+            if self._processor_seconds() - worked > _AT_WORK * self.patience_seconds:
+                end, worked = now + self.patience_seconds, self._processor_seconds()
+        return time.monotonic() - started
+
+    def _processor_seconds(self) -> float:
+        """Return how long the thread has computed; 0 where the system cannot tell."""
+        try:
+            return 0.0 if self._clock is None else time.clock_gettime(self._clock)
+        except OSError:  # it has just ended
+            return 0.0
 
     def _put(self, message: Callable[[], object] | None, patience_seconds: float = 0.0) -> None:
         try:
@@ -80,6 +104,8 @@ class Mirror(Tracker):
 
     def _work(self) -> None:
         opened = False
+        if hasattr(time, "pthread_getcpuclockid"):
+            self._clock = time.pthread_getcpuclockid(threading.get_ident())
         while (message := self._messages.get()) is not None:
             # A tracker that has been opened is closed, even after it was switched off.
             if self._off and not (opened and message is self._closing):

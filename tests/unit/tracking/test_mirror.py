@@ -152,6 +152,30 @@ def test_a_hanging_tracker_costs_its_patience_at_the_end_and_no_more(tmp_path, w
     ]
 
 
+@pytest.mark.skipif(
+    not hasattr(time, "pthread_getcpuclockid"), reason="no processor time of single threads here"
+)
+@pytest.mark.parametrize("works_for, is_heard", [(1.0, True), (60.0, False)])
+def test_a_tracker_at_work_gets_more_time_but_not_forever(
+    tmp_path, warnings_of, works_for, is_heard
+):
+    class Computing(Remembering):
+        def begin(self, run):
+            end = time.monotonic() + works_for
+            while time.monotonic() < end and not over.is_set():
+                sum(range(1000))
+            super().begin(run)
+
+    over = threading.Event()
+    mirror = Mirror(Computing(), "X", patience_seconds=0.2)
+    started = time.monotonic()
+    tell(mirror, tmp_path)
+    assert 0.5 < time.monotonic() - started < 15.0
+    assert bool(mirror.tracker.heard) == is_heard
+    assert len(warnings_of()) == (0 if is_heard else 1)
+    over.set()
+
+
 def test_a_full_queue_switches_off_once_and_still_closes(tmp_path, warnings_of):
     tracker = Remembering(seconds=0.05)
     mirror = Mirror(tracker, "X", queue_size=2)
