@@ -9,9 +9,11 @@ import contextlib
 import importlib
 import inspect
 import io
+import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -46,6 +48,7 @@ API = {
     ),
     "Runs": ("scilab_rl.experiment.run", "scilab_rl.results.RunResult"),
 }
+BASELINES = Path(__file__).parents[1] / "baselines"
 _SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Shapes")
 _ITEM = re.compile(r"(\*{0,2}[\w, ]+?): (.*)")
 
@@ -198,6 +201,30 @@ def search_page() -> Iterator[str]:
         yield from fenced("yaml", path.read_text(encoding="utf-8"))
 
 
+def baselines_page() -> Iterator[str]:
+    """Yield what the performance tests were passed with, from the stored baselines."""
+    yield "# What has been learned"
+    yield ""
+    yield "The [performance tests](../howto/testing.md) whose results are kept in `baselines/`."
+    yield "*Mean* is that over the runs, each judged in 100 episodes of its own after training; its"
+    yield "interval holds at any moment of stopping."
+    yield ""
+    rows = []
+    for path in sorted(BASELINES.rglob("*.json")):
+        result = json.loads(path.read_text(encoding="utf-8"))
+        verdict, asked = result["verdict"], result["definition"]["conditions"]
+        steps = sorted(run["steps"] for run in result["runs"])
+        rows.append((
+            f"`{result['name']}`",
+            f"{asked['eval_value']:g} within {asked['max_steps']:,}",
+            f"{verdict['mean']:.3g} [{verdict['low']:.3g}, {verdict['high']:.3g}]",
+            verdict["n_runs"],
+            f"{steps[0]:,} to {steps[-1]:,}",
+            result["date"],
+        ))  # fmt: skip
+    yield from table(("Test", "Needed", "Mean", "Runs", "Steps", "Date"), rows)
+
+
 def api_page() -> Iterator[str]:
     """Yield the classes and functions that are meant to be used from code."""
     yield "# Classes and functions\n"
@@ -307,5 +334,6 @@ PAGES: dict[str, Callable[[], Iterator[str]]] = {
     "environments": environments_page,
     "metrics": metrics_page,
     "search": search_page,
+    "baselines": baselines_page,
     "api": api_page,
 }
