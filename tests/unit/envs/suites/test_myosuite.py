@@ -24,7 +24,7 @@ def test_missing_package_names_the_constraints(monkeypatch) -> None:
 
 def test_its_versions_fit_ours() -> None:
     pinned = (ROOT / "constraints-myosuite.txt").read_text(encoding="utf-8").splitlines()
-    versions = dict(line.split("==") for line in pinned if not line.startswith("#"))
+    versions = dict(line.split("==") for line in pinned if "==" in line)
     assert versions["torch"] == "2.13.0"
     assert versions["gymnasium"].startswith("1.2.")
     assert versions["mujoco"].startswith("3.6.")
