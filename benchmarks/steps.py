@@ -46,9 +46,6 @@ ENTRIES = (
     Entry("cleansac", overrides=("algorithm=cleansac",)),
     Entry("cleansac bfloat16", overrides=("algorithm=cleansac", "algorithm.precision=bfloat16")),
     Entry("jaxsac", overrides=("algorithm=jaxsac",)),
-    Entry(
-        "jaxsac, 8 environments", overrides=("algorithm=jaxsac", "n_envs=8", "vector=subprocess")
-    ),
 )
 
 
