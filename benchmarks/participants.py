@@ -59,7 +59,7 @@ class Run:
     """A run in a process of its own, which learns for an epoch whenever it is told to.
 
     Args:
-        overrides: Of the configuration, in which nothing is switched on.
+        overrides: Of the configuration.
     """
 
     def __init__(self, overrides: Sequence[str]) -> None:

@@ -19,6 +19,7 @@ import argparse
 import statistics
 import tempfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,14 +55,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--rounds", type=int, default=4, help="of two turns each; default 4")
     parser.add_argument("--steps", type=int, default=400, help="per turn; default 400")
-    parser.add_argument("--only", nargs="*", help="names of rows")
+    parser.add_argument("--only", nargs="*", choices=[entry.name for entry in ENTRIES])
     parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
     arguments = parser.parse_args()
     entries = [entry for entry in ENTRIES if not arguments.only or entry.name in arguments.only]
     if not peers_are_installed():
         entries = [entry for entry in entries if entry.script is None]
-    with tempfile.TemporaryDirectory() as folder:
-        ends: list[Callable[[], None]] = []
+    with tempfile.TemporaryDirectory() as folder, ExitStack() as ends:
         turns = {
             entry.name: start(entry, arguments.steps, Path(folder) / str(index), ends)
             for index, entry in enumerate(entries)
@@ -69,15 +69,11 @@ def main() -> None:
         for turn in turns.values():  # compiles, and takes the first random steps
             turn()
         times = take_turns(turns, arguments.rounds)
-        for end in ends:
-            end()
     rows = {name: compare(taken, times, arguments.steps) for name, taken in times.items()}
     publish(table(rows), rows, arguments.json)
 
 
-def start(
-    entry: Entry, n_steps: int, folder: Path, ends: list[Callable[[], None]]
-) -> Callable[[], Seconds]:
+def start(entry: Entry, n_steps: int, folder: Path, ends: ExitStack) -> Callable[[], Seconds]:
     """Start a participant, and return what lets it take its turn."""
     if entry.script is not None:
         peer = Peer(entry.script, "live", BATCH_SIZE, *NET_ARCH)
@@ -89,7 +85,7 @@ def start(
             f"eval_after_n_steps={n_steps}", f"base_logdir={folder}",
         )
     )  # fmt: skip
-    ends.append(run.end)
+    ends.callback(run.end)
     return run.epoch
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import dataclasses
 import getpass
 import importlib.util
@@ -39,6 +40,7 @@ _PAUSE = 0.05  # seconds between two deliveries: scenes that go together cost th
 _TOGETHER = 32  # scenes in one delivery
 _PATIENCE = 2.0  # seconds for what is waiting at the end
 _MEMORY = "512MiB"  # of the server; the oldest scenes go first
+_PAGE_ENDS = 5.0  # seconds that are waited for it
 _STOP = object()
 # Keeps the page from outliving a program that is killed: its own death closes the pipe.
 _GUARD = """
@@ -318,4 +320,5 @@ def _end_page(guard: subprocess.Popen[bytes] | None) -> None:
     if guard is not None:
         assert guard.stdin is not None
         guard.stdin.close()
-        guard.wait()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            guard.wait(_PAGE_ENDS)
