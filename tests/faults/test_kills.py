@@ -25,6 +25,7 @@ SHORT = (
     ENV, "n_epochs=3", "eval_after_n_steps=40", "n_test_rollouts=1", "seed=7", "mlflow=0",
     "tuned=false", "save_model_freq=30",
 )  # fmt: skip
+DISCRETE = ("env=scilab_rl.testing:TinyReachDiscrete-v0", *SHORT[1:])
 _OFF_POLICY = ("algorithm.buffer_size=500", "algorithm.batch_size=8", "algorithm.net_arch=[8]")
 ALGORITHMS = {
     "cleansac": ("algorithm=cleansac", *SHORT, *_OFF_POLICY),
@@ -37,12 +38,9 @@ ALGORITHMS = {
     ),
     "cleanppo": ("algorithm=cleanppo", *SHORT, "algorithm.n_steps=20", "algorithm.batch_size=10"),
     "ppo": ("algorithm=ppo", *SHORT, "algorithm.n_steps=20", "algorithm.batch_size=10"),
-    "onestepac": ("algorithm=onestepac", *SHORT),
+    "onestepac": ("algorithm=onestepac", *DISCRETE),
     "random": ("algorithm=random", *SHORT),
-    "cleandqn": (
-        "algorithm=cleandqn", "env=scilab_rl.testing:TinyReachDiscrete-v0", *SHORT[1:],
-        *_OFF_POLICY,
-    ),
+    "cleandqn": ("algorithm=cleandqn", *DISCRETE, *_OFF_POLICY),
     "actor_critic": ("algorithm=actor_critic", *SHORT, "+flatten_obs=1"),
 }  # fmt: skip
 # Each place where a checkpoint or a metric is written, and at which passing the process is killed:
@@ -59,6 +57,7 @@ IN_METRICS = (
     "file.before_replace",
 )
 POINTS = [f"{name}:{count}:SIGKILL" for name in (*IN_CHECKPOINTS, *IN_METRICS) for count in (2, 3)]
+POINTS.append("file.before_replace:9:SIGKILL")  # the first three come before a run is one
 POINTS.append("files.in_discarding:1:SIGKILL")  # of the oldest generation; so short a run has few
 
 
@@ -80,13 +79,19 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory):
 
 def finish(algorithm: str, folder: Path) -> Path:
     """Resume the run, or start anew where it was killed before there was a whole checkpoint."""
-    (run,) = runs_in(folder)
-    done = scilab_rl("resume", str(run), cwd=folder)
-    if done.code != 0:
+    if not (runs := runs_in(folder)):  # killed before it was one
+        done = scilab_rl("clean", "--yes", cwd=folder)
+        assert "run without any result" in done.output, done.errors
+        assert not list(folder.glob("data/*/*/*"))
+    else:
+        (run,) = runs
+        done = scilab_rl("resume", str(run), cwd=folder)
+        if done.code == 0:
+            return run
         assert "no checkpoint" in done.error, done.errors
         shutil.rmtree(run)
-        assert scilab_rl(*ALGORITHMS[algorithm], cwd=folder).code == 0
-        (run,) = runs_in(folder)
+    assert scilab_rl(*ALGORITHMS[algorithm], cwd=folder).code == 0
+    (run,) = runs_in(folder)
     return run
 
 
@@ -101,7 +106,7 @@ def check_whole(run: Path) -> None:
     assert len(list(run.glob("checkpoints/step_*"))) <= 2
 
 
-@pytest.mark.parametrize("point", [*POINTS[1::5], POINTS[-1]])
+@pytest.mark.parametrize("point", [*POINTS[3::5], POINTS[-1]])
 def test_f02_killed_while_writing(point: str, uninterrupted, tmp_path: Path) -> None:
     kill_at(point, uninterrupted, tmp_path)
 

@@ -133,6 +133,7 @@ def test_files_grow_by_a_line_per_episode_and_a_row_per_epoch(tmp_path: Path) ->
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")  # MLflow's own
 def test_runs_at_the_same_time_on_one_mlflow_database(tmp_path: Path) -> None:
     mlflow = pytest.importorskip("mlflow")
     from .harness import Process

@@ -97,15 +97,15 @@ def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
     crash_point("checkpoint.before_link")
     point_to(folder / LAST, directory)
     crash_point("checkpoint.before_forgetting")
-    for old in _generations(run_dir)[GENERATIONS:]:
-        discard(old)
+    _forget(run_dir, older_than=directory)
     return directory
 
 
 def load_latest(run_dir: Path) -> tuple[Snapshot, int]:
     """Load the newest checkpoint that is whole, and its step.
 
-    What a killed process left unfinished is removed.
+    What a killed process left unfinished is removed, and so are the generations that it had no
+    time to forget.
 
     Raises:
         CheckpointError: If there is none.
@@ -122,6 +122,7 @@ def load_latest(run_dir: Path) -> tuple[Snapshot, int]:
         if damaged:
             _log.warning("%s Using the older %s.", " ".join(damaged), directory.name)
         _tell_other_versions(manifest)
+        _forget(run_dir, older_than=directory)
         return snapshot, manifest["step"]
     raise CheckpointError(
         " ".join(damaged)
@@ -149,6 +150,13 @@ def _tell_other_versions(manifest: Mapping[str, Any]) -> None:
 def _generations(run_dir: Path) -> list[Path]:
     """Return the checkpoints, newest first."""
     return sorted((run_dir / FOLDER).glob("step_*[0-9]"), reverse=True)
+
+
+def _forget(run_dir: Path, *, older_than: Path) -> None:
+    """Remove all but the newest generations, and never one that is needed or newer than that."""
+    for old in _generations(run_dir)[GENERATIONS:]:
+        if old.name < older_than.name:
+            discard(old)
 
 
 def _normalization_layers(env: Any) -> list[Any]:

@@ -85,6 +85,4 @@ def main(arguments: Sequence[str]) -> int:
 
 
 if __name__ == "__main__":
-    exit_code = main(sys.argv[1:])
-    sys.stderr.flush()
-    os._exit(exit_code)  # on a full disk, the viewer's package would wait for ever
+    sys.exit(main(sys.argv[1:]))

@@ -39,7 +39,10 @@ def write_movie(clip: Clip, path: Path) -> None:
             writer.add(frames[index])
     finally:
         writer.close()
-    n_written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the encoder hides failures
+    try:
+        n_written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the encoder hides failures
+    except RuntimeError:  # it cannot even be opened; the message is all that ffmpeg has to say
+        n_written = 0
     if n_written != len(frames):
         raise OSError(f"{n_written} of {len(frames)} frames could be written; is the disk full?")
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from scilab_rl import files
 from scilab_rl.errors import MissingDependencyError
 from scilab_rl.visualization.panels import COLOURS, grid
 from scilab_rl.visualization.records import (
@@ -25,7 +26,6 @@ from scilab_rl.visualization.records import (
 APPLICATION = "scilab-rl"
 PHASES = {"train": "training", "eval": "evaluation"}
 _GAP = float("nan")
-_PATIENCE = 60.0  # seconds for writing a file
 _WHAT_IT_SAYS = "warn,re_quota_channel=error"  # that a viewer is slow is told once, by us
 
 
@@ -196,15 +196,22 @@ def layout(panels: Iterable[str]) -> Any:
 
 
 def write_viewer_file(clip: Clip, path: Path) -> None:
-    """Write a clip as ``.rrd``; its wall time runs at the task's frame rate."""
+    """Write a clip as ``.rrd``; its wall time runs at the task's frame rate.
+
+    Raises:
+        OSError: If it could not be written, for example because the disk is full.
+    """
     rerun = import_rerun("to write recordings of the viewer")
     recording = rerun.RecordingStream(APPLICATION)
-    recording.set_sinks(rerun.FileSink(str(path)), default_blueprint=layout(clip.info.panels))
+    # Not into a file of its own making: on a full disk it may wait for ever.
+    memory = recording.memory_recording()
+    recording.send_blueprint(layout(clip.info.panels), make_active=False)
     stream = ViewerStream(recording)
     stream.begin(clip.info)
     stream.add(clip.records, [index / clip.info.fps for index in range(len(clip.records))])
-    recording.flush(timeout_sec=_PATIENCE)
+    content = memory.drain_as_bytes()
     recording.disconnect()
+    files.atomic_write(path, lambda file: file.write(content))
 
 
 def _curve_view(rerun: Any, panel: str) -> Any:
