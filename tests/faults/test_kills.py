@@ -36,6 +36,20 @@ ALGORITHMS = {
     "td3": (
         "algorithm=td3", *SHORT, *_OFF_POLICY[:2], "algorithm.policy_kwargs={net_arch: [8]}",
     ),
+    # Noise of Stable-Baselines3 that has a memory of its own.
+    "sac with gSDE": (
+        "algorithm=sac", *SHORT, *_OFF_POLICY[:2], "algorithm.policy_kwargs={net_arch: [8]}",
+        "algorithm.use_sde=true",
+    ),
+    "ddpg with correlated noise": (
+        "algorithm=ddpg", *SHORT, *_OFF_POLICY[:2], "algorithm.policy_kwargs={net_arch: [8]}",
+        "algorithm.action_noise._target_="
+        "stable_baselines3.common.noise.OrnsteinUhlenbeckActionNoise", "n_envs=2",
+    ),
+    "ppo with gSDE": (
+        "algorithm=ppo", *SHORT, "algorithm.n_steps=20", "algorithm.batch_size=10",
+        "algorithm.use_sde=true",
+    ),
     "cleanppo": ("algorithm=cleanppo", *SHORT, "algorithm.n_steps=20", "algorithm.batch_size=10"),
     "ppo": ("algorithm=ppo", *SHORT, "algorithm.n_steps=20", "algorithm.batch_size=10"),
     "onestepac": ("algorithm=onestepac", *DISCRETE),
@@ -126,7 +140,7 @@ def kill_at(point: str, uninterrupted, folder: Path) -> None:
     check_whole(run)
 
 
-@pytest.mark.parametrize("algorithm", ["cleanppo"])
+@pytest.mark.parametrize("algorithm", ["cleanppo", "sac with gSDE"])
 def test_f01_killed_and_resumed_is_as_uninterrupted(
     algorithm: str, uninterrupted, tmp_path: Path
 ) -> None:

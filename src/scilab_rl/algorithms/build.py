@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,7 +11,7 @@ import numpy as np
 from gymnasium import spaces
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
-from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.noise import ActionNoise, VectorizedActionNoise
 from stable_baselines3.common.vec_env import VecEnv
 
 from scilab_rl.algorithms.arguments import INTRINSIC, accepts
@@ -52,7 +53,7 @@ def build_algorithm(
         arguments["policy"] = policy_name(env)
     if "replay_buffer_class" in arguments:
         _choose_replay_buffer(arguments, env)
-    if isinstance(noise := arguments.get("action_noise"), NormalActionNoise):
+    if isinstance(noise := arguments.get("action_noise"), ActionNoise):
         arguments["action_noise"] = _shaped_noise(noise, env)
     given = {"env": env, "seed": seed, "device": device}
     arguments |= {name: value for name, value in given.items() if accepts(cls, name)}
@@ -128,8 +129,11 @@ def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
     return max(wanted, needed)
 
 
-def _shaped_noise(noise: NormalActionNoise, env: VecEnv) -> NormalActionNoise:
-    shape = env.action_space.shape or ()
-    return NormalActionNoise(
-        np.broadcast_to(noise._mu, shape), np.broadcast_to(noise._sigma, shape)
-    )
+def _shaped_noise(noise: ActionNoise, env: VecEnv) -> ActionNoise:
+    """Return noise for each environment, of the actions' shape where it is given as one number."""
+    noise, shape = copy.copy(noise), env.action_space.shape or ()
+    for name in ("_mu", "_sigma"):
+        if hasattr(noise, name):
+            setattr(noise, name, np.broadcast_to(getattr(noise, name), shape))
+    noise.reset()
+    return VectorizedActionNoise(noise, env.num_envs) if env.num_envs > 1 else noise

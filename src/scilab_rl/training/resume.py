@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -82,6 +82,7 @@ def continue_from(snapshot: Snapshot, model: Any, trainer: Any) -> None:
         _begin_new_episodes(model)
     # Retelling draws no numbers from the global generators; they come last to be sure.
     set_random_state(restored["random"])
+    trainer.at_first_rollout = _undo_preparations(model, restored["random"])
 
 
 def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
@@ -188,6 +189,26 @@ def _retell_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[st
             return False
     env.continue_from(observed)
     return True
+
+
+def _undo_preparations(model: Any, random: dict[str, Any]) -> Callable[[], None]:
+    """Return what undoes how ``learn`` prepares noise for its first rollout.
+
+    Action noise is reset there, and that of gSDE (arXiv 2005.05719) is drawn, which the state has
+    behind it.
+    """
+    noise = getattr(model, "action_noise", None)
+    policy = getattr(model, "actor", None) or getattr(model, "policy", None)
+    prepared = [*getattr(noise, "noises", [noise]), getattr(policy, "action_dist", None)]
+    # What they draw replaces what they had, and does not change it: references are enough.
+    states = [(thing, dict(vars(thing))) for thing in prepared if hasattr(thing, "__dict__")]
+
+    def put_back() -> None:
+        for thing, state in states:  # in place: `learn` has handed them on already
+            vars(thing).update(state)
+        set_random_state(random)
+
+    return put_back
 
 
 def _begin_new_episodes(model: Any) -> None:

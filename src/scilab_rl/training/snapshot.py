@@ -24,6 +24,7 @@ import numpy as np
 import torch
 from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.vec_env import VecEnv
 
 from scilab_rl.errors import CheckpointError
@@ -41,6 +42,7 @@ _KEPT_IN_MODULES = (
     torch.Tensor,
     np.random.Generator,
     torch.optim.Optimizer,
+    StateDependentNoiseDistribution,
 )
 _CLOSED = (VecEnv, gym.Env, MetricLogger, BaseCallback, torch.device, torch.dtype, type)
 
@@ -274,7 +276,7 @@ class _Restore:
             if current.shape == saved.shape:
                 with torch.no_grad():
                     return current.copy_(saved)
-            if current.requires_grad:  # an optimizer holds on to it
+            if current.requires_grad and current.is_leaf:  # an optimizer holds on to it
                 raise ValueError(f"{node['name']} has shape {_shape(saved)}, not {_shape(current)}")
         return saved.clone()
 

@@ -96,6 +96,7 @@ class Trainer(BaseCallback):
         self.before_evaluation: list[Callable[[int], Any]] = []
         self.may_go_on: list[Callable[[int, int, Mapping[str, float]], bool]] = []
         self.after_step: list[Callable[[], Any]] = []
+        self.at_first_rollout: Callable[[], Any] | None = None
         self.stop_request = StopRequest()
         self.statistics: RolloutStatistics | None = None
         self.instabilities = InstabilityRecord(run_dir / "unstable")
@@ -136,6 +137,9 @@ class Trainer(BaseCallback):
 
     def _on_rollout_start(self) -> None:
         """Save here, where nothing is pending."""
+        if self.at_first_rollout is not None:
+            self.at_first_rollout()
+            self.at_first_rollout = None
         steps = self.model.num_timesteps
         if self.stop_request:
             self._stop(steps, resume.take(self.model, self))
