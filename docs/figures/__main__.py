@@ -124,9 +124,9 @@ def figure_her() -> None:
             title=title, xlim=(-0.4, 1.2), ylim=(-0.5, 1), aspect="equal", xticks=[], yticks=[]
         )
         axes.title.set_fontsize(10)
-    panels[0].annotate("goal", env.goal, (-16, 16), textcoords="offset points")
+    panels[0].annotate("goal", env.goal, (-16, 21), textcoords="offset points")
     panels[1].plot(*env.goal, "x", color=GREY)
-    panels[1].annotate("reached", reached, (-16, -28), textcoords="offset points")
+    panels[1].annotate("reached", reached, (14, -28), textcoords="offset points", ha="right")
     save(figure, "her")
 
 

@@ -100,6 +100,24 @@ def test_slow_blocks(page: Path, desk: Path) -> None:
             execute(block, f"{page.relative_to(ROOT)}:{block.line}", slow=True)
 
 
+@pytest.mark.slow
+def test_commands_of_the_readme(desk: Path) -> None:
+    """What installs, opens a window or continues an interrupted run is tested elsewhere."""
+    elsewhere = ("make", "source", "scilab-rl view", "scilab-rl resume")
+    readme = ROOT / "README.md"
+    typed = [
+        (block, command)
+        for block in blocks_of(readme)
+        if block.language == "bash"
+        for command in block.commands
+        if not command.startswith(elsewhere)
+    ]
+    assert len(typed) > 4
+    short = " ".join(["seeds=2", *(f"{key}={value}" for key, value in SHORT.items())])
+    for block, command in typed:
+        type_command(command.replace("seeds=5", short), {}, f"README.md:{block.line}")
+
+
 @pytest.mark.parametrize("page", pages(), ids=lambda p: p.relative_to(DOCS).as_posix())
 def test_reasons_are_given_and_targets_of_make_exist(page: Path) -> None:
     targets = set(re.findall(r"(?m)^([a-z-]+):", (ROOT / "Makefile").read_text(encoding="utf-8")))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import re
 import subprocess
 import sys
@@ -78,3 +80,20 @@ def test_every_picture_is_used_somewhere() -> None:
     figures = sorted((ROOT / "docs" / "images").glob("figure_*.png"))
     assert figures
     assert [path.name for path in figures if path.name not in texts] == []
+
+
+def test_figures_are_drawn_from_what_is_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("matplotlib")
+    monkeypatch.syspath_prepend(str(ROOT))
+    figures = importlib.import_module("docs.figures.__main__")
+    monkeypatch.setattr(figures, "IMAGES", tmp_path)
+    for draw in figures.FIGURES:
+        draw()
+    drawn = {path.name for path in tmp_path.iterdir()}
+    assert drawn == {path.name for path in (ROOT / "docs" / "images").glob("figure_*.png")}
+    kept = json.loads(text_of(figures.CURVES))
+    lengths = {len(run) for name in ("with hindsight", "without") for run in kept[name]}
+    assert lengths == {len(kept["steps"])}
+    assert len(kept["without"]) == len(kept["with hindsight"]) == figures.N_SEEDS
