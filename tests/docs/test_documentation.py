@@ -100,7 +100,6 @@ def test_slow_blocks(page: Path, desk: Path) -> None:
             execute(block, f"{page.relative_to(ROOT)}:{block.line}", slow=True)
 
 
-@pytest.mark.slow
 def test_commands_of_the_readme(desk: Path) -> None:
     """What installs, opens a window or continues an interrupted run is tested elsewhere."""
     elsewhere = ("make", "source", "scilab-rl view", "scilab-rl resume")
@@ -113,9 +112,8 @@ def test_commands_of_the_readme(desk: Path) -> None:
         if not command.startswith(elsewhere)
     ]
     assert len(typed) > 4
-    short = " ".join(["seeds=2", *(f"{key}={value}" for key, value in SHORT.items())])
     for block, command in typed:
-        type_command(command.replace("seeds=5", short), {}, f"README.md:{block.line}")
+        type_command(command, {}, f"README.md:{block.line}")
 
 
 @pytest.mark.parametrize("page", pages(), ids=lambda p: p.relative_to(DOCS).as_posix())
@@ -203,9 +201,7 @@ def shortened(arguments: list[str], more: dict[str, str]) -> list[str]:
     """Return the arguments of a command with those that make a training short."""
     flags = {"--help", "--version", "--cfg"}
     first = arguments[0] if arguments else ""
-    if flags & set(arguments) or (first in COMMANDS and first not in ("profile", "resume")):
-        return arguments
-    if first == "resume":
+    if flags & set(arguments) or (first in COMMANDS and first not in ("profile", "experiment")):
         return arguments
     values = SHORT | more
     algorithm = dict(a.split("=", 1) for a in arguments if "=" in a).get("algorithm", "cleansac")

@@ -17,8 +17,6 @@ import sysconfig
 import time
 from pathlib import Path
 
-import pytest
-
 from ..e2e.commands import quiet_environment
 from .pages import DOCS, ROOT, Block, blocks_of, insert_after
 
@@ -43,7 +41,6 @@ for line in view.stderr:
         view.send_signal(signal.SIGINT)
 sys.exit(view.wait(30) not in (0, 130))
 """
-pytestmark = pytest.mark.slow
 
 
 def has_private_network() -> bool:
