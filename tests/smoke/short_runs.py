@@ -140,7 +140,7 @@ def fitting_environment(algorithm: str) -> str:
     raise AssertionError(f"no tiny environment fits {algorithm}")
 
 
-def tests_and_searches() -> tuple[list[str], list[str]]:
+def names_of_tests_and_searches() -> tuple[list[str], list[str]]:
     """Return the performance tests, and the searches as ``group=name``."""
     tests = sorted(performance_tests())
     searches = [f"search={name}" for name in sorted(config_files("search"))]

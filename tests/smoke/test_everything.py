@@ -30,7 +30,7 @@ from tests.smoke.short_runs import (
     fitting_algorithm,
     fitting_environment,
     missing_packages_skip,
-    tests_and_searches,
+    names_of_tests_and_searches,
     train,
 )
 
@@ -39,7 +39,7 @@ pytestmark = [
     # What the packages of simulators and of JAX say about themselves is not what is tested here.
     pytest.mark.filterwarnings("default"),
 ]
-TESTS, SEARCHES = tests_and_searches()
+TESTS, SEARCHES = names_of_tests_and_searches()
 _SHORTER = (
     "eval_after_n_steps=40",
     "n_epochs=1",
