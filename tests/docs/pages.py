@@ -14,7 +14,6 @@ _BLOCK = re.compile(
     r"(?P<text>.*?)^[ ]*```[ ]*$",
     re.MULTILINE | re.DOTALL,
 )
-_SLOW = "<!-- test: slow -->"
 
 
 @dataclass(frozen=True)
@@ -55,11 +54,6 @@ class Block:
 def pages() -> list[Path]:
     """Return all pages."""
     return sorted(DOCS.rglob("*.md"))
-
-
-def is_slow(page: Path) -> bool:
-    """Tell whether a whole page is for `make test-slow`."""
-    return page.read_text(encoding="utf-8").startswith(_SLOW)
 
 
 def blocks_of(page: Path) -> list[Block]:

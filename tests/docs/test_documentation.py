@@ -20,7 +20,7 @@ import yaml
 from scilab_rl.cli import COMMANDS, run_command_line
 
 from ..e2e.commands import quiet_environment
-from .pages import DOCS, ROOT, Block, blocks_of, insert_after, is_slow, pages
+from .pages import DOCS, ROOT, Block, blocks_of, insert_after, pages
 
 SHORT = {
     "n_epochs": "1",
@@ -42,16 +42,13 @@ EXECUTED = ("bash", "python", "yaml")
 STORY = DOCS / "story.md"  # has a test of its own
 
 
-def fast_and_slow() -> list:
-    """Return the pages that have something to execute; slow ones are marked."""
-    found = [
+def executable_pages() -> list[Path]:
+    """Return the pages that have something to execute."""
+    return [
         page
         for page in pages()
         if page != STORY and any(b.language in EXECUTED for b in blocks_of(page))
     ]
-    marks = {page: [pytest.mark.slow] if is_slow(page) else [] for page in found}
-    names = {page: page.relative_to(DOCS).with_suffix("").as_posix() for page in found}
-    return [pytest.param(page, id=names[page], marks=marks[page]) for page in found]
 
 
 @pytest.fixture
@@ -81,23 +78,13 @@ def forget_desk() -> None:
             del gymnasium.registry[env_id]
 
 
-@pytest.mark.parametrize("page", fast_and_slow())
+@pytest.mark.parametrize(
+    "page", executable_pages(), ids=lambda p: p.relative_to(DOCS).with_suffix("").as_posix()
+)
 def test_page(page: Path, desk: Path) -> None:
     for block in blocks_of(page):
         if block.language in EXECUTED:
             execute(block, f"{page.relative_to(ROOT)}:{block.line}")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("page", [p for p in pages() if not is_slow(p)], ids=lambda p: p.stem)
-def test_slow_blocks(page: Path, desk: Path) -> None:
-    """The whole page again, with the blocks that are too slow for everyday."""
-    blocks = blocks_of(page)
-    if not any(block.said("slow") is not None for block in blocks):
-        pytest.skip("no slow blocks")
-    for block in blocks:
-        if block.language in EXECUTED:
-            execute(block, f"{page.relative_to(ROOT)}:{block.line}", slow=True)
 
 
 def test_commands_of_the_readme(desk: Path) -> None:
@@ -147,9 +134,9 @@ def test_columns_of_a_run_are_explained(desk: Path) -> None:
     assert [name for name in names if f"`{name}`" not in explained] == []
 
 
-def execute(block: Block, place: str, *, slow: bool = False) -> None:
+def execute(block: Block, place: str) -> None:
     """Do with a block what a reader would do with it."""
-    if block.said("skip") is not None or (block.said("slow") is not None and not slow):
+    if block.said("skip") is not None:
         return
     if block.title is not None:
         write(block)
@@ -160,8 +147,7 @@ def execute(block: Block, place: str, *, slow: bool = False) -> None:
     else:
         more = {}
         for comment in block.comments:
-            words = re.sub(r"^slow,? ?", "", comment).split()
-            more |= dict(word.split("=", 1) for word in words if "=" in word)
+            more |= dict(word.split("=", 1) for word in comment.split() if "=" in word)
         for command in block.commands:
             type_command(command, more, place, fails=block.said("fails") is not None)
 
