@@ -25,6 +25,7 @@ COLOURS = (
 BACKGROUND, FRAME, GRID, INK, FAINT = "#ffffff", "#d4d4d8", "#f1f1f4", "#18181b", "#71717a"
 _ROWS = 4  # panels in one column, until there are four columns
 _MIN_PANEL_HEIGHT = 112
+NO_VALUE = "-"  # the font has no dash
 _SMOOTH = 2  # everything that does not move is drawn twice as large and scaled down
 _TITLE, _LEFT, _RIGHT, _BOTTOM = 22, 50, 12, 18  # pixels around the curves
 
@@ -202,7 +203,7 @@ class PanelSheet:
             value, colour = curve[index], COLOURS[number % len(COLOURS)]
             if value is not None:
                 draw.circle((x, panel.y(value)), 3, fill=colour, outline=BACKGROUND)
-            text = "–" if value is None else number_text(value)
+            text = NO_VALUE if value is None else number_text(value)
             if label and len(panel.curves) <= 4:
                 text = f"{label}: {text}"
             written = self._write_value(draw, panel, text, colour, written)

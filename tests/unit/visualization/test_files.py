@@ -210,3 +210,12 @@ def test_page_names_the_unit_of_a_metric_that_has_one(tmp_path: Path) -> None:
     page = (tmp_path / "x.html").read_text(encoding="utf-8")
     assert '"name": "entropy (nats)"' in page
     assert '"name": "reward"' in page
+
+
+def test_the_font_has_what_panels_write() -> None:
+    from scilab_rl.visualization.panels import NO_VALUE, _font
+
+    font = _font(12)
+    missing = bytes(font.getmask("\ue123"))  # of a letter that no font has
+    written = {*"0123456789.e+…:", *NO_VALUE}
+    assert [letter for letter in written if bytes(font.getmask(letter)) == missing] == []
