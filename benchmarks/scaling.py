@@ -1,7 +1,7 @@
 """How speed changes with size: environments side by side, networks, batches.
 
 * ``environments``: steps per second of FetchReach with random actions, for 1 to 8 environments in
-  one process and in a process each;
+  one process, in one per core and in a process each;
 * ``updates``: ms per update of `cleansac` and `jaxsac` as width, depth and batch grow, beside the
   matrix products that SAC cannot do without (the row of that name in `updates.py`).
 
@@ -32,7 +32,7 @@ from scilab_rl.envs.vectorize import EnvSettings, make_train_env
 from scilab_rl.workspace import open_desk
 
 N_ENVS = (1, 2, 4, 8)
-VECTORS = ("inprocess", "subprocess")
+VECTORS = ("inprocess", "workers", "subprocess")
 # Batch size and hidden layers: width, depth and batch around 256 and [256, 256].
 SIZES = (
     "256,64,64", "256,128,128", "256,256,256", "256,512,512", "256,1024,1024",

@@ -69,7 +69,12 @@ KEYS = (
     ),
     Key("wrappers", LIST, "wrappers around the environment, each with a _target_"),
     Key("n_envs", WHOLE, "training environments side by side", low=1, high=4096),
-    Key("vector", TEXT, "where they run", choices=("inprocess", "subprocess")),
+    Key(
+        "vector",
+        TEXT,
+        "where they run: in the main process, in one process per core, in a process each",
+        choices=("inprocess", "workers", "subprocess"),
+    ),
     Key("fast_fetch", SWITCH, "make Fetch's steps faster; its observations stay the same"),
     Key(
         "on_nan",

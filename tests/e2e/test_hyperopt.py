@@ -59,6 +59,7 @@ def test_leaves_a_whole_report(finished: Path) -> None:
     assert [run.state for run in runs] == ["complete"] * 6
     first = config_of(finished / runs[0].run_dir)
     assert (first["seed"], first["group"]) == (runs[0].seed, "mine")
+    assert first["algorithm"]["gamma"] == 0.99  # what the configuration has comes first
     rows = json.loads((finished / runs[0].run_dir / "result.json").read_text())
     assert rows["metrics"]["eval/success_rate"] == runs[0].values[-1]
 

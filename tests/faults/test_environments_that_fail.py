@@ -204,11 +204,12 @@ def test_f09_in_a_process_of_its_own() -> None:
         act(fault="missing", place="achieved_goal", at=4, vector="subprocess")
 
 
-def test_f14_dead_worker_is_one_line_and_no_deadlock() -> None:
+@pytest.mark.parametrize("vector", ["subprocess", "workers"])
+def test_f14_dead_worker_is_one_line_and_no_deadlock(vector: str) -> None:
     started = time.monotonic()
     message = r"its worker process \d ended with exit code -9, maybe out of memory"
     with pytest.raises(EnvironmentError_, match=message):
-        act(fault="kill", at=4, vector="subprocess")
+        act(fault="kill", at=4, vector=vector)
     assert time.monotonic() - started < 60  # most of it is starting the workers
     assert not living_children()
 

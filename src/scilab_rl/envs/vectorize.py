@@ -16,7 +16,6 @@ import gymnasium as gym
 from gymnasium.envs.registration import load_env_creator
 from stable_baselines3.common.vec_env import (
     DummyVecEnv,
-    SubprocVecEnv,
     VecEnv,
     VecEnvWrapper,
     VecNormalize,
@@ -28,7 +27,9 @@ from scilab_rl.envs.observed import ObservedVecEnv
 from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.envs.replayable import ReplayableEpisode
 from scilab_rl.envs.stability import guard
+from scilab_rl.envs.workers import WorkersVecEnv
 from scilab_rl.errors import ConfigError, EnvironmentError_, ScilabRLError, did_you_mean
+from scilab_rl.machine import n_cores
 from scilab_rl.seeding import derive_seed
 
 Wrapper = Callable[..., Any]
@@ -44,7 +45,8 @@ class EnvSettings:
         wrappers: Applied in order. A wrapper class of Gymnasium wraps each environment, one of
             Stable-Baselines3's ``VecEnvWrapper`` the vector of them.
         n_envs: How many run side by side.
-        vector: ``inprocess`` or ``subprocess``.
+        vector: ``inprocess``; ``subprocess``, a process each; or ``workers``, one per core, which
+            share them.
         seed: Seed of the run.
         modules: Imported first, because they register environments.
         render_mode: ``rgb_array`` or ``human`` when frames are wanted.
@@ -127,9 +129,11 @@ def observed_layer(env: VecEnv) -> ObservedVecEnv:
 
 def _make(settings: EnvSettings, phase: str) -> VecEnv:
     env: VecEnv
-    if settings.vector == "subprocess" and settings.n_envs > 1:
-        env = SubprocVecEnv(
+    n_workers = _n_workers(settings)
+    if n_workers:
+        env = WorkersVecEnv(
             [partial(_make_in_worker, settings)] * settings.n_envs,
+            n_workers,
             start_method=os.environ.get("SCILAB_RL_START_METHOD"),
         )
     else:
@@ -142,6 +146,15 @@ def _make(settings: EnvSettings, phase: str) -> VecEnv:
             env = wrapper(env)
     env.seed(derive_seed(settings.seed, phase))
     return env
+
+
+def _n_workers(settings: EnvSettings) -> int:
+    """Return how many processes share the environments; 0: the main process has them."""
+    if settings.vector == "inprocess" or settings.n_envs == 1:
+        return 0
+    if settings.vector == "subprocess":
+        return settings.n_envs
+    return min(settings.n_envs, n_cores())
 
 
 def _wraps_vectors(wrapper: Wrapper) -> bool:

@@ -9,8 +9,9 @@ from typing import Any
 
 from scilab_rl.errors import ConfigError
 from scilab_rl.hyperopt.jobs import JobPool
-from scilab_rl.hyperopt.pool import Pool, n_cores
+from scilab_rl.hyperopt.pool import Pool
 from scilab_rl.hyperopt.schedulers import RayScheduler, SubmititScheduler
+from scilab_rl.machine import n_cores
 
 _SLURM_JOBS = 16
 _log = logging.getLogger(__name__)

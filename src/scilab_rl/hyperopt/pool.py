@@ -15,6 +15,7 @@ from types import TracebackType
 
 from scilab_rl.hyperopt import worker
 from scilab_rl.hyperopt.worker import Message, Task
+from scilab_rl.machine import n_cores
 
 
 @dataclass
@@ -163,10 +164,3 @@ class Pool:
             hint = ", maybe out of memory" if -code == signal.SIGKILL else ""
             return f"the worker was killed by {signal.Signals(-code).name}{hint}"
         return f"the worker ended with exit code {code}"
-
-
-def n_cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

@@ -1,11 +1,12 @@
 """Which setting deserves the next run, and which one has won: pure functions of the scores so far.
 
-Each setting first gets ``min_runs`` runs. Half of the budget goes to new settings; the other half
-is a race between those that may still be best: successive halving (Jamieson and Talwalkar, 2016,
-arXiv 1502.07943), asynchronous as in ASHA (Li et al., 2020, arXiv 1810.05934), with repeats in
-place of epochs as its resource. A rung has twice the repeats of the one below; a setting climbs
-when its mean is in the upper half of its rung *and* its confidence interval still reaches that of
-the leader. When only one setting may still be best, nobody earns further repeats.
+Each setting first gets ``min_runs`` runs. Half of the budget goes to new settings, or more where
+that suffices for all settings of the space. The rest is a race between those that may still be
+best: successive halving (Jamieson and Talwalkar, 2016, arXiv 1502.07943), asynchronous as in ASHA
+(Li et al., 2020, arXiv 1810.05934), with repeats in place of epochs as its resource. A rung has
+twice the repeats of the one below; a setting climbs when its mean is in the upper half of its rung
+*and* its confidence interval still reaches that of the leader. When only one setting may still be
+best, nobody earns further repeats.
 """
 
 from __future__ import annotations
@@ -89,7 +90,14 @@ class Decision:
     number: int = -1
 
 
-def decide(entries: Sequence[Entry], rules: RaceRules, *, n_used: int, n_left: float) -> Decision:
+def decide(
+    entries: Sequence[Entry],
+    rules: RaceRules,
+    *,
+    n_used: int,
+    n_left: float,
+    try_all: bool = False,
+) -> Decision:
     """Return what a free worker shall do next.
 
     Args:
@@ -97,6 +105,7 @@ def decide(entries: Sequence[Entry], rules: RaceRules, *, n_used: int, n_left: f
         rules: What may be spent.
         n_used: Runs started so far, failed and pruned ones included.
         n_left: How many settings of the space have not been tried; infinite for most.
+        try_all: Whether all settings come before the race.
     """
     running = any(entry.n_running for entry in entries)
     pause = Decision(WAIT if running else DONE)
@@ -108,7 +117,7 @@ def decide(entries: Sequence[Entry], rules: RaceRules, *, n_used: int, n_left: f
         if not entry.out and on_its_way:
             return Decision(RUN, entry.number)
     may_ask = n_left > 0 and (rules.budget - n_used >= rules.min_runs or not entries)
-    exploring = n_used < rules.exploration * rules.budget or not rules.racing
+    exploring = try_all or n_used < rules.exploration * rules.budget or not rules.racing
     if may_ask and exploring:
         return Decision(ASK)
     climber = _climber(entries, rules, only_upper_half=may_ask or running)

@@ -22,9 +22,10 @@ _MOST_DUPLICATES = 20
 class SettingsSource:
     """Gives each setting at most once.
 
-    A space with no more settings than the budget can try is tried completely, in an order drawn by
-    the study's seed. Otherwise the sampler is asked; settings that it proposes again are told as
-    failed, because further repeats are the race's decision.
+    The setting that the configuration has already comes first, so that what one has is always part
+    of the comparison. A space with no more settings than the budget can try is then tried
+    completely, in an order drawn by the study's seed. Otherwise the sampler is asked; settings that
+    it proposes again are told as failed, because further repeats are the race's decision.
 
     Args:
         ledger: The memory of the study; its lock must be held during each call.
@@ -32,12 +33,23 @@ class SettingsSource:
         sampler: Name of the sampler; ``grid`` tries the whole space in its order.
         seed: Seed of the study.
         rules: What may be spent.
+        present: The setting that the configuration has, if the space holds it; not for ``grid``.
+
+    Attributes:
+        is_exhaustive: Whether all settings of the space will be tried.
     """
 
     def __init__(
-        self, ledger: Ledger, space: SearchSpace, sampler: str, seed: int, rules: RaceRules
+        self,
+        ledger: Ledger,
+        space: SearchSpace,
+        sampler: str,
+        seed: int,
+        rules: RaceRules,
+        present: Setting | None = None,
     ) -> None:
         self.ledger = ledger
+        self.present = None if sampler == "grid" else present
         self.space = space
         self.sampler = sampler
         self.seed = seed
@@ -62,6 +74,8 @@ class SettingsSource:
             n_settings: How many settings there are. It makes the draw reproducible, whatever a
                 crash has left among the trials.
         """
+        if n_settings == 0 and self.present is not None:
+            return self._ask_for(self.present, n_settings)
         for attempt in range(0 if self.is_exhaustive else _MOST_DUPLICATES):
             earlier = settings_of(self.ledger.trials())
             number, setting = self._ask(n_settings, attempt)
@@ -71,16 +85,19 @@ class SettingsSource:
         untried = self._untried()
         if not untried:
             return None
-        if not self.ledger.trials(TrialState.WAITING):
-            self.ledger.study.enqueue_trial(untried[0])
-            self.ledger.refresh()
-        return self._ask(n_settings, _MOST_DUPLICATES)[0]
+        return self._ask_for(untried[0], n_settings)
 
     def discard_torn(self) -> None:
         """Give up trials whose process was killed while it was asking the sampler."""
         for trial in self.ledger.trials(TrialState.RUNNING):
             if len(trial.params) < len(self._expected(trial.params)):
                 self.ledger.tell(trial.number, state=TrialState.FAIL)
+
+    def _ask_for(self, setting: Setting, n_settings: int) -> int:
+        if not self.ledger.trials(TrialState.WAITING):  # else a killed process has done so
+            self.ledger.study.enqueue_trial(setting)
+            self.ledger.refresh()
+        return self._ask(n_settings, _MOST_DUPLICATES)[0]
 
     def _ask(self, n_settings: int, attempt: int) -> tuple[int, Setting]:
         study = self.ledger.study

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 Setting = dict[str, Any]
 KINDS = ("float", "int", "categorical")
 _ENTRY_KEYS = ("type", "low", "high", "step", "log", "choices", "when")
+_ABSENT = object()
 _SCALARS = (bool, int, float, str, type(None))
 
 
@@ -92,6 +93,20 @@ class Parameter:
         count = math.floor((self.high - self.low) / self.step + 1e-9) + 1
         return [self.low + i * self.step for i in range(count)]
 
+    def own(self, value: Any) -> list[Any]:
+        """Return the value as the parameter has it, in a list that is empty when it has not."""
+        if self.kind == "categorical":
+            typed = override_text(value)
+            pairs = zip(self.choices, self.labels, strict=True)
+            return [label for choice, label in pairs if override_text(choice) == typed][:1]
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            return []
+        values = self.values()
+        if values is not None:
+            return [v for v in values if math.isclose(v, value, rel_tol=1e-9)]
+        assert self.low is not None and self.high is not None
+        return [value] if self.low <= value <= self.high else []
+
     def describe(self) -> dict[str, Any]:
         """Return what can be written as JSON and compared."""
         empty = ("None", "False", "()", "{}")  # but not 0, which is a bound
@@ -125,6 +140,20 @@ class SearchSpace:
         for parameter in self.parameters:
             if parameter.exists_in(setting):
                 setting[parameter.name] = parameter.suggest(trial)
+        return setting
+
+    def setting_in(self, values: Mapping[str, Any]) -> Setting | None:
+        """Return the setting that a configuration has, or None where the space does not hold it.
+
+        Args:
+            values: Name to value, as in ``config.flat``.
+        """
+        setting: Setting = {}
+        for parameter in self.parameters:
+            if parameter.exists_in(setting):
+                if not (own := parameter.own(values.get(parameter.name, _ABSENT))):
+                    return None
+                setting[parameter.name] = own[0]
         return setting
 
     def overrides(self, setting: Setting) -> list[str]:

@@ -29,7 +29,7 @@ from scilab_rl.hyperopt.runs import (
 )
 from scilab_rl.hyperopt.settings import StudySettings
 from scilab_rl.hyperopt.source import SettingsSource, settings_of
-from scilab_rl.hyperopt.space import SearchSpace
+from scilab_rl.hyperopt.space import SearchSpace, Setting
 from scilab_rl.hyperopt.worker import Message, Task
 from scilab_rl.seeding import derive_seed
 
@@ -48,6 +48,7 @@ class RunPlan:
         budget_steps: Environment steps of a whole run.
         threshold: For the score ``steps_to_threshold``.
         seed: Seed of the study; equal repeats of all settings share the seed derived from it.
+        present: Their setting if nothing were searched, where the space holds it.
     """
 
     overrides: tuple[str, ...]
@@ -56,6 +57,7 @@ class RunPlan:
     budget_steps: int
     threshold: float
     seed: int
+    present: Setting | None = None
 
 
 @dataclass
@@ -104,7 +106,9 @@ class Study:
         self.observer = observer
         self.stop = StopReasons()
         self.runs: list[Run] = []
-        self.source = SettingsSource(ledger, space, settings.sampler, plan.seed, settings.rules)
+        self.source = SettingsSource(
+            ledger, space, settings.sampler, plan.seed, settings.rules, plan.present
+        )
         self.pruning = Pruning(
             settings.pruner if settings.rules.racing else "none",
             settings.pruner_warmup_epochs,
@@ -177,6 +181,7 @@ class Study:
             self.settings.rules,
             n_used=sum(not run.is_final for run in self.runs),
             n_left=self.source.n_left(),
+            try_all=self.source.is_exhaustive,
         )
         if decision.action == race.RUN:
             return self._new_run(decision.number, self._next_repeat(decision.number))

@@ -125,6 +125,7 @@ def run_study(
         budget_steps=cfg.n_epochs * cfg.eval_after_n_steps,
         threshold=cfg.early_stop_threshold,
         seed=definition["seed"],
+        present=space.setting_in(config.flat(cfg)),
     )
     prepare_trackers(cfg)
     from scilab_rl.hyperopt.progress import StudyProgress

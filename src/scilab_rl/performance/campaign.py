@@ -20,8 +20,9 @@ from omegaconf import OmegaConf
 from scilab_rl import assembly, config
 from scilab_rl.errors import ScilabRLError
 from scilab_rl.hyperopt.jobs import JobPool
-from scilab_rl.hyperopt.pool import Pool, n_cores
+from scilab_rl.hyperopt.pool import Pool
 from scilab_rl.hyperopt.worker import Message, Task
+from scilab_rl.machine import n_cores
 from scilab_rl.performance.conditions import KEY, REFERENCE, Conditions, read_conditions
 from scilab_rl.performance.gate import OPEN
 from scilab_rl.performance.identity import identity_of

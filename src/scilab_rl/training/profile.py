@@ -16,7 +16,7 @@ WAITING, ACTING, STORING = "waiting for updates", "acting", "storing"
 EVALUATION, LOGGING, SAVING, RENDERING = "evaluation", "logging", "saving", "rendering"
 OTHER = "everything else"
 REMEDIES = {
-    ENVIRONMENT: "n_envs=4 vector=subprocess steps several environments on several cores",
+    ENVIRONMENT: "n_envs=4 vector=workers steps several environments on several cores",
     SAMPLING: "a smaller algorithm.batch_size draws less",
     UPDATE: "algorithm=jaxsac, smaller networks or fewer algorithm.gradient_steps compute less",
     WAITING: "smaller networks or batches, fewer algorithm.gradient_steps, or "

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 from gymnasium.wrappers import FlattenObservation, TransformReward
-from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from scilab_rl.envs.vectorize import (
     EnvSettings,
@@ -43,13 +43,43 @@ def test_evaluation_has_its_own_stream_and_one_environment():
     assert evaluation.reset()["desired_goal"].tolist() != training.reset()["desired_goal"].tolist()
 
 
-def test_subprocesses_do_the_same_as_one_process():
+@pytest.mark.parametrize(("vector", "n_processes"), [("subprocess", 3), ("workers", 2)])
+def test_processes_do_the_same_as_one_process(vector, n_processes, monkeypatch):
     """Also shows that workers can import environments that are named by their module."""
-    inside = make_train_env(EnvSettings(REACH, n_envs=2, seed=1))
-    outside = make_train_env(EnvSettings(REACH, n_envs=2, seed=1, vector="subprocess"))
+    monkeypatch.setattr("scilab_rl.envs.vectorize.n_cores", lambda: 2)
+    inside = make_train_env(EnvSettings(REACH, n_envs=3, seed=1))
+    outside = make_train_env(EnvSettings(REACH, n_envs=3, seed=1, vector=vector))
     assert isinstance(observed_layer(inside).venv, DummyVecEnv)
-    assert isinstance(observed_layer(outside).venv, SubprocVecEnv)
+    assert len(observed_layer(outside).venv.processes) == n_processes
     assert course(inside, 20) == course(outside, 20)
+
+
+def test_episodes_continue_in_other_workers(monkeypatch):
+    monkeypatch.setattr("scilab_rl.envs.vectorize.n_cores", lambda: 2)
+    settings = EnvSettings(REACH, n_envs=3, seed=1, vector="workers")
+    env = make_train_env(settings)
+    env.reset()
+    for i in range(4):
+        seen = env.step(np.full((3, 2), np.sin(i), np.float32))[0]
+    states = env.env_method("episode_state")
+    other = make_train_env(settings)
+    for i in (2, 0, 1):
+        (there,) = other.env_method("replay_episode", states[i], indices=i)
+        assert there["observation"].tolist() == seen["observation"][i].tolist()
+    act = np.full((3, 2), 0.3, np.float32)
+    for _ in range(12):  # beyond the end of the episode, so that the goals are drawn alike
+        one, two = env.step(act)[0], observed_layer(other).venv.step(act)[0]
+        assert repr(dict(one)) == repr(dict(two))
+    env.close(), other.close()
+
+
+def test_no_more_workers_than_environments(monkeypatch):
+    monkeypatch.setattr("scilab_rl.envs.vectorize.n_cores", lambda: 8)
+    env = make_train_env(EnvSettings(REACH, n_envs=2, vector="workers"))
+    assert len(observed_layer(env).venv.processes) == 2
+    env.close()
+    alone = make_train_env(EnvSettings(REACH, n_envs=1, vector="workers"))
+    assert isinstance(observed_layer(alone).venv, DummyVecEnv)
 
 
 def test_wrappers_apply_in_order_to_environments_and_to_the_vector():

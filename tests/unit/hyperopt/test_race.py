@@ -47,6 +47,13 @@ def test_explores_with_half_of_the_budget_and_then_races() -> None:
     assert decide(entries, RULES, n_used=10, n_left=math.inf) == Decision(RUN, 0)
 
 
+def test_a_space_that_fits_is_tried_before_the_race() -> None:
+    entries = [Entry(0, (0.5, 0.7)), Entry(1, (0.4, 0.7)), Entry(2, (0.0, 0.1))]
+    ask = decide(entries, RULES, n_used=10, n_left=1, try_all=True)
+    assert ask == Decision(ASK)
+    assert decide(entries, RULES, n_used=10, n_left=0, try_all=True) == Decision(RUN, 0)
+
+
 def test_a_promoted_setting_runs_to_its_next_rung() -> None:
     entries = [Entry(0, (0.5, 0.7), n_running=1), Entry(1, (0.4, 0.7))]
     assert decide(entries, RULES, n_used=10, n_left=math.inf) == Decision(RUN, 0)

@@ -9,10 +9,10 @@ from omegaconf import OmegaConf
 from scilab_rl.errors import ConfigError
 from scilab_rl.hyperopt.folders import expand_best_of
 from scilab_rl.hyperopt.launchers import n_workers
-from scilab_rl.hyperopt.pool import n_cores
 from scilab_rl.hyperopt.samplers import SAMPLERS, make_sampler
 from scilab_rl.hyperopt.settings import StudySettings, read_settings
 from scilab_rl.hyperopt.sweep import is_study, read_request, refuse_changes
+from scilab_rl.machine import n_cores
 from scilab_rl.workspace import SHIPPED_CONF
 
 

@@ -96,6 +96,40 @@ def test_conditional_parameters_exist_only_where_they_belong() -> None:
         assert len(CONDITIONAL.overrides(setting)) == len(setting)
 
 
+MIXED = SearchSpace(
+    [
+        Parameter("++rate", "float", 1e-4, 1e-2, log=True),
+        Parameter("gamma", "float", 0.9, 0.99, step=0.01),
+        Parameter("n", "int", 1, 9, 2),
+        Parameter("net", "categorical", choices=([64, 64], [256], None, True)),
+    ]
+)
+
+
+@pytest.mark.parametrize("net", [[64, 64], [256], None, True])
+def test_setting_of_a_configuration_is_typed_as_the_space_has_it(net: object) -> None:
+    values = {"rate": 1e-3, "gamma": 0.95, "n": 5, "net": net, "other": 1}
+    setting = MIXED.setting_in(values)
+    assert setting is not None
+    assert setting["net"] in MIXED.parameters[3].labels
+    assert setting["gamma"] in (MIXED.parameters[1].values() or [])
+    words = dict(word.lstrip("+").split("=") for word in MIXED.overrides(setting))
+    assert words["net"] == override_text(net)
+    assert (words["rate"], words["n"]) == ("0.001", "5")
+
+
+@pytest.mark.parametrize(
+    "outside",
+    [{"rate": 0.1}, {"gamma": 0.955}, {"n": 2}, {"n": True}, {"net": [64]}, {"net": 1},
+     {"rate": "auto"}, {"rate": None}],
+)  # fmt: skip
+def test_configuration_outside_of_the_space_has_no_setting(outside: dict) -> None:
+    values = {"rate": 1e-3, "gamma": 0.95, "n": 5, "net": [256]}
+    assert MIXED.setting_in(values) is not None
+    assert MIXED.setting_in(values | outside) is None
+    assert MIXED.setting_in({"rate": 1e-3}) is None
+
+
 def test_conditions_name_parameters_that_come_before() -> None:
     with pytest.raises(ConfigError, match="must come before"):
         SearchSpace([Parameter("a", "int", 0, 1, when={"b": 1})])

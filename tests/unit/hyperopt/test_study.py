@@ -21,6 +21,7 @@ from scilab_rl.hyperopt.folders import DATABASE, STOP_FILE
 from scilab_rl.hyperopt.ledger import Ledger
 from scilab_rl.hyperopt.runs import COMPLETE, FAILED, LOST, PRUNED, RUNNING
 from scilab_rl.hyperopt.source import settings_of
+from scilab_rl.hyperopt.space import SearchSpace
 from scilab_rl.hyperopt.summary import summarize
 
 from . import toy
@@ -63,6 +64,31 @@ def test_small_space_is_tried_completely_and_then_raced(tmp_path: Path) -> None:
     assert settings[study.winner()]["x"] in (0.5, 0.75)
     runs = Counter(settings[run.trial]["x"] for run in searched(study))
     assert runs[0.0] == 2, "0.0 is far behind and must not earn further repeats"
+
+
+def test_space_that_takes_the_whole_budget_is_tried_completely(tmp_path: Path) -> None:
+    study = toy.run(tmp_path / "study", space=toy.CHOICES, max_trials=10, pruner="none")
+    assert sorted(Counter(run.trial for run in searched(study)).values()) == [2] * 5
+
+
+@pytest.mark.parametrize("space", [toy.SPACE, toy.CHOICES])
+def test_what_the_configuration_has_is_tried_first(tmp_path: Path, space: SearchSpace) -> None:
+    study = toy.run(
+        tmp_path / "study", space=space, max_trials=10, pruner="none", present={"x": 0.25}
+    )
+    settings = settings_of(study.ledger.trials())
+    assert settings[study.runs[0].trial] == {"x": 0.25}
+    values = [setting["x"] for setting in settings.values()]
+    assert len(set(values)) == len(values) > 3
+
+
+def test_grid_keeps_its_order(tmp_path: Path) -> None:
+    study = toy.run(
+        tmp_path / "study", space=toy.CHOICES, sampler="grid", max_trials=10, pruner="none",
+        n_workers=1, present={"x": 0.75},
+    )  # fmt: skip
+    values = [setting["x"] for setting in settings_of(study.ledger.trials()).values()]
+    assert values == [0.0, 0.25, 0.5, 0.75, 1.0]
 
 
 @pytest.mark.slow

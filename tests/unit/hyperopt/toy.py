@@ -32,13 +32,16 @@ def run(
     n_workers: int = 2,
     storage: str | None = None,
     open_pool: Callable[[Path], Any] | None = None,
+    present: dict[str, Any] | None = None,
     **sweeper: Any,
 ) -> Study:
     """Run a toy study to its end, with workers of this process unless ``open_pool`` says other."""
     given = {"max_trials": 12, "min_trials_per_param": 2, "n_final_runs": 1, "seed": 5} | sweeper
     settings = read_settings(given)
     ledger = Ledger(directory, storage, settings.directions)
-    plan = RunPlan(overrides, "eval/success_rate", N_EPOCHS, N_EPOCHS * EPOCH_STEPS, 0.9, seed=5)
+    plan = RunPlan(
+        overrides, "eval/success_rate", N_EPOCHS, N_EPOCHS * EPOCH_STEPS, 0.9, 5, present
+    )
     with ledger.locked():
         ledger.define(definition(space, settings))
     pools = Pool(n_workers, directory / "workers", main=toy_worker.main)
