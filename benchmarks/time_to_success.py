@@ -40,21 +40,21 @@ class Task(NamedTuple):
 
 
 HER = "algorithm.replay_buffer_class=her"
+COMPILED = {name: (f"algorithm={name}",) for name in ("jaxsac", "jaxtd3")}
 TASKS = {
     "reach": Task(
         "FetchReach-v4",
         1000,
         20_000,
         {
-            "jaxsac": ("algorithm=jaxsac",),
-            "jaxtd3": ("algorithm=jaxtd3",),
+            **COMPILED,
             "cleansac": ("algorithm=cleansac",),
             PEER: ("algorithm=sac", HER),
         },
     ),
-    "push": Task("FetchPush-v4", 20_000, 600_000, {"jaxtd3": ("algorithm=jaxtd3",)}),
-    "pick": Task("FetchPickAndPlace-v4", 20_000, 600_000, {"jaxtd3": ("algorithm=jaxtd3",)}),
-    "slide": Task("FetchSlide-v4", 20_000, 600_000, {"jaxtd3": ("algorithm=jaxtd3",)}),
+    "push": Task("FetchPush-v4", 20_000, 600_000, COMPILED),
+    "pick": Task("FetchPickAndPlace-v4", 20_000, 600_000, COMPILED),
+    "slide": Task("FetchSlide-v4", 20_000, 600_000, COMPILED),
 }
 
 
