@@ -191,7 +191,7 @@ def _start_and_signal(
     arguments: list[str], folder: Path, number: signal.Signals
 ) -> subprocess.CompletedProcess:
     """Start a run, wait for its second epoch, and send a signal in the middle of the third."""
-    before = set(folder.glob("data/*/*"))
+    before = set(folder.glob("data/*-*-*/*"))
     process = subprocess.Popen(
         command(*arguments),
         cwd=folder,
@@ -202,7 +202,7 @@ def _start_and_signal(
     )
     deadline = time.monotonic() + 60
     while time.monotonic() < deadline and process.poll() is None:
-        new = [run for run in folder.glob("data/*/*") if run not in before and run.is_dir()]
+        new = [run for run in folder.glob("data/*-*-*/*") if run not in before and run.is_dir()]
         if new and (new[0] / "metrics.csv").is_file():
             if len((new[0] / "metrics.csv").read_text().splitlines()) >= 3:
                 break

@@ -1,8 +1,8 @@
 """A vector environment in which a few worker processes share many environments.
 
-A process per environment pays a message per step and finds its caches cold at each of its turns,
-so that more processes than cores are slower than fewer. Here each worker steps its share of the
-environments one after the other and answers once.
+With a process per environment each step is a message and a change of processes. Here each worker
+steps its share of the environments one after the other and answers once, which is faster where
+there are more environments than cores (``benchmarks/scaling.py``).
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class WorkersVecEnv(VecEnv):
     Args:
         makers: One function per environment that makes it.
         n_workers: Number of processes; their shares differ by one environment at most.
-        start_method: Of the processes: ``forkserver``, ``spawn`` or ``fork``; None: the first of
-            these that the platform has.
+        start_method: Of the processes: ``forkserver``, ``spawn`` or ``fork``; None: ``forkserver``
+            where the platform has it, else ``spawn``.
 
     Attributes:
         processes: The workers.
