@@ -177,15 +177,15 @@ def _serve(pipe: Any, main_end: Any, makers: CloudpickleWrapper) -> None:
             pipe.send(answer)
 
 
-def _joined(observations: Sequence[Any]) -> Any:
-    """Join the observations of all workers.
+def _joined(parts: Sequence[Any]) -> Any:
+    """Join what each worker has answered: observations of any kind, rewards or dones.
 
     Shapes:
-        observations: ``(n_envs of the worker, ...)`` for each worker and entry.
+        parts: ``(n_envs of the worker, ...)`` for each worker and entry.
     """
-    first = observations[0]
+    first = parts[0]
     if isinstance(first, dict):
-        return {key: np.concatenate([part[key] for part in observations]) for key in first}
+        return {key: np.concatenate([part[key] for part in parts]) for key in first}
     if isinstance(first, tuple):
-        return tuple(map(np.concatenate, zip(*observations, strict=True)))
-    return np.concatenate(observations)
+        return tuple(map(np.concatenate, zip(*parts, strict=True)))
+    return np.concatenate(parts)
