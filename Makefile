@@ -10,6 +10,10 @@ BENCH ?=
 # Further settings of `make demo`, such as DEMO=n_epochs=1.
 DEMO ?=
 
+# No program that is started here shall report about its users.
+export DO_NOT_TRACK ?= true
+export MLFLOW_DISABLE_TELEMETRY ?= true
+
 .DEFAULT_GOAL := help
 .PHONY: help setup check format test test-slow smoke performance test-myosuite bench demo docs docs-figures gallery figure-fetchpush mlflow audit clean-venv
 
@@ -24,7 +28,7 @@ $(VENV)/.installed: pyproject.toml constraints.txt
 	@touch $@
 
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
-	@$(BIN)/python -m scilab_rl.commands.doctor --rendering-hint
+	@$(BIN)/python -m scilab_rl.cli.doctor --rendering-hint
 
 # CleanRL's script runs with newer versions than it asks for, see benchmarks/peers/cleanrl_sac.py.
 .venv-peers/.installed: benchmarks/peers/requirements.txt
@@ -85,10 +89,10 @@ figure-fetchpush: setup  ## the paper's figure: critic variance while the block 
 	  algorithm.gamma=0.95 algorithm.tau=0.05 algorithm.learning_starts=1000
 	$(BIN)/python scripts/figure_fetchpush.py last --falls 24
 
-mlflow: $(VENV)/.installed  ## browse the recorded runs on http://127.0.0.1:5000
-	$(BIN)/mlflow ui --host 127.0.0.1 --port 5000 --backend-store-uri sqlite:///data/mlflow.db
+mlflow: $(VENV)/.installed  ## browse the learning curves of all runs, on http://127.0.0.1:5000
+	$(BIN)/python -m scilab_rl.cli.main mlflow
 
-audit: $(VENV)/.installed  ## compare the pinned versions with known vulnerabilities
+audit: $(VENV)/.installed  ## report known vulnerabilities of the pinned versions (needs a network)
 	@$(BIN)/python scripts/audit.py
 
 clean-venv:  ## remove .venv (nothing else)

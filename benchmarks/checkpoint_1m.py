@@ -16,7 +16,8 @@ import numpy as np
 import psutil
 from stable_baselines3 import SAC, HerReplayBuffer
 
-from scilab_rl.envs.vectorize import EnvSettings, make_train_env
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.envs.vectorize import make_train_env
 from scilab_rl.training import checkpoint
 from scilab_rl.training.snapshot import capture, restore
 
@@ -56,7 +57,7 @@ def main() -> None:
 
 def make_model(n: int) -> SAC:
     """Build SAC with hindsight replay on FetchPush."""
-    env = make_train_env(EnvSettings("FetchPush-v4"))
+    env = make_train_env(RunConfig("FetchPush-v4", seed=1))
     return SAC("MultiInputPolicy", env, buffer_size=n, replay_buffer_class=HerReplayBuffer)
 
 

@@ -3,7 +3,7 @@
 Blocks of steps of ours and of the original alternate, so that both see the same machine; the median
 of the blocks counts, in processor time. Ours come with all wrappers of a run, the originals bare.
 "identical" compares observations, rewards and endings to the last bit over all steps, from the same
-seeds; "-" where ours is a task of its own beside its nearest relative.
+seeds; "-" where ours is a different task, compared with the most similar one.
 
 Run: python benchmarks/environments.py [--steps N] [--json FILE]
 """
@@ -26,10 +26,11 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.utils.seeding import np_random
 
-from scilab_rl.envs.examination import equal
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.envs.checker import equal
 from scilab_rl.envs.fingerprint import scripted_action
 from scilab_rl.envs.registration import resolve_env_id
-from scilab_rl.envs.vectorize import EnvSettings, make_single_env
+from scilab_rl.envs.vectorize import make_single_env
 
 BLOCK = 50
 COLUMNS = (
@@ -184,7 +185,7 @@ def measure(pair: Pair, n_steps: int) -> dict[str, Any]:
     """Return the row of one pair; times in ms."""
     resolve_env_id(pair.env_id)
     limit = min(gym.spec(pair.env_id).max_episode_steps or BLOCK, BLOCK)  # for many resets
-    ours = Course(make_single_env(EnvSettings(pair.env_id)), limit)
+    ours = Course(make_single_env(RunConfig(pair.env_id)), limit)
     other = Course(pair.make_original(), limit)
     identical = True
     for _ in range(-(-n_steps // BLOCK)):

@@ -29,10 +29,12 @@ from typing import Any
 
 import numpy as np
 
-from scilab_rl.hyperopt.ledger import open_ledger
+from scilab_rl.config.schema import RunConfig
 from scilab_rl.metrics.logger import MetricLogger
-from scilab_rl.results import RunResult, all_runs, read_epochs
-from scilab_rl.tracking.base import RunInfo
+from scilab_rl.results import RunResult
+from scilab_rl.run.directory import all_runs, read_epochs
+from scilab_rl.search.storage import open_study
+from scilab_rl.tracking.base import TrackedRun
 from scilab_rl.tracking.files import FilesTracker
 
 ENV = "env=scilab_rl.testing:TinyReach-v0"
@@ -65,7 +67,7 @@ def study(folder: Path, scale: float, pause: float = 1.0) -> dict[str, Any]:
                 kills["parent"] += _kill(process.pid)
                 process.wait()
                 process, starts = _start(words, folder), starts + 1
-    runs = open_ledger(folder / "data" / "studies" / "load").runs()
+    runs = open_study(folder / "data" / "studies" / "load").runs()
     states = Counter(run.state for run in runs)
     return {
         "trials": n_trials,
@@ -159,8 +161,7 @@ def metrics(folder: Path, scale: float) -> dict[str, Any]:
         logger.record("train/x", index)
     recorded = n / (time.perf_counter() - started)
     tracker = FilesTracker()
-    run = RunInfo(folder, folder, "Env", "algorithm", 1, n, 1)
-    tracker.begin(run)
+    tracker.begin(TrackedRun(RunConfig(), folder))
     values = {f"train/{index}": value for index, value in enumerate(np.random.rand(50).tolist())}
     n_epochs = max(2, n // 1000)
     started = time.perf_counter()

@@ -14,12 +14,16 @@ from typing import Any
 
 from turns import Seconds
 
+from scilab_rl.tracking.background import BackgroundTracker
+from scilab_rl.training.callbacks import Pruning, ReportToTrackers
+from scilab_rl.training.loop import Trainer
+
 PATIENCE_SECONDS = 120.0
 PEERS_PYTHON = Path(__file__).parents[1] / ".venv-peers" / "bin" / "python"
 
 
 def peers_are_installed() -> bool:
-    """Tell whether there are peers, and if not, how they are installed."""
+    """Return whether there are peers, and if not, how they are installed."""
     if not PEERS_PYTHON.exists():
         sys.stdout.write("Some peers are missing: `make .venv-peers/.installed` installs them.\n")
     return PEERS_PYTHON.exists()
@@ -84,55 +88,50 @@ class Run:
 
 def learn_in_turns(connection: Connection, overrides: Sequence[str]) -> None:
     """Train, and wait for permission before each epoch."""
-    import hydra
+    from scilab_rl.config.compose import compose
+    from scilab_rl.run.run import start_run
 
-    from scilab_rl import config, experiment
-    from scilab_rl.training import trainer
-
-    watcher = Watcher(connection, trainer.evaluate)
-    trainer.evaluate = watcher.evaluate
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        cfg = config.compose(
-            [
-                "env=FetchReach-v4", "seed=1", "n_epochs=1000000", "early_stop_threshold=2",
-                "mlflow=0", "++tracking.console.enabled=false", *overrides,
-            ]
-        )  # fmt: skip
-        experiment.run(cfg, watch=watcher.watch)
+    cfg = compose(
+        [
+            "env=FetchReach-v4", "seed=1", "n_epochs=1000000", "early_stop_threshold=2",
+            "mlflow=0", "++tracking.console.enabled=false", *overrides,
+        ]
+    )  # fmt: skip
+    start_run(cfg, callbacks=[Watcher(connection)])
 
 
-class Watcher:
+class Watcher(Pruning):
     """Lets a run wait between its epochs, and tells how long they take.
 
     Args:
         connection: To the benchmark.
-        evaluate: What evaluates the policy.
     """
 
-    def __init__(self, connection: Connection, evaluate: Callable[..., Any]) -> None:
+    def __init__(self, connection: Connection) -> None:
+        super().__init__(self.end_epoch)
         self._connection = connection
-        self._evaluate = evaluate
         self._begun = self._evaluation = Seconds(0.0, 0.0)
         self._trackers: list[Any] = []
         self._written = threading.Semaphore(0)
 
-    def watch(self, session: Any) -> None:
+    def begin(self, trainer: Trainer) -> None:
         """Attach to a run that is about to begin."""
-        from scilab_rl.tracking.mirror import Mirror
-
-        self._trackers = [t for t in session.trackers.trackers if isinstance(t, Mirror)]
+        reporting = next(c for c in trainer.callbacks if isinstance(c, ReportToTrackers))
+        trackers = reporting.trackers.trackers
+        self._trackers = [t for t in trackers if isinstance(t, BackgroundTracker)]
         for mirror in self._trackers:
             mirror.tracker.epoch = followed_by(self._written.release, mirror.tracker.epoch)
-        session.trainer.may_go_on.append(self.end_epoch)
+        self._evaluate = trainer.evaluate
+        trainer.evaluate = self.evaluate
         self._connection.send("ready")
         self.wait()
 
-    def evaluate(self, *arguments: Any) -> Any:
+    def evaluate(self) -> dict[str, float]:
         """Evaluate, and note how long it takes."""
         started = Seconds.now()
-        outcome = self._evaluate(*arguments)
+        values = self._evaluate()
         self._evaluation = Seconds.now() - started
-        return outcome
+        return values
 
     def end_epoch(self, _step: int, _epoch: int, _values: Mapping[str, float]) -> bool:
         """Report, and wait for the next turn."""

@@ -35,8 +35,9 @@ import torch
 from stable_baselines3 import HerReplayBuffer
 from stable_baselines3.common.vec_env import VecEnv
 
-from scilab_rl.algorithms.replay import HindsightReplayBuffer
-from scilab_rl.envs.vectorize import EnvSettings, make_train_env
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.envs.vectorize import make_train_env
+from scilab_rl.learning.replay import HindsightReplayBuffer
 from scilab_rl.training import checkpoint
 from scilab_rl.training.snapshot import capture, restore
 
@@ -55,7 +56,7 @@ def main() -> None:
     parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    env = make_train_env(EnvSettings("FetchPush-v4", n_envs=N_ENVS))
+    env = make_train_env(RunConfig("FetchPush-v4", n_envs=N_ENVS, seed=1))
     buffers = {name: make(cls, env, arguments.transitions) for name, cls in PEERS.items()}
     results: Results = {name: {} for name in PEERS}
     for name in PEERS:
@@ -128,7 +129,7 @@ def alone(function: Callable[..., Any], *arguments: Any) -> Any:
 def resident_growth(name: str, n_transitions: int) -> int:
     """Return by how many bytes this process grows while a buffer is made and filled."""
     torch.set_num_threads(1)
-    env = make_train_env(EnvSettings("FetchPush-v4", n_envs=N_ENVS))
+    env = make_train_env(RunConfig("FetchPush-v4", n_envs=N_ENVS, seed=1))
     for _ in episodes(env, EPISODE):  # what only making the steps takes is not the buffer's
         pass
     process = psutil.Process()

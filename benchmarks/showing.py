@@ -29,14 +29,17 @@ from pathlib import Path
 from subprocess import DEVNULL, Popen
 from typing import Any
 
-import hydra
 import numpy as np
 
-from scilab_rl import assembly, config, experiment
-from scilab_rl.results import RunDirectory
-from scilab_rl.visualization.live import LOOPBACK, LiveViewer, free_port, start_viewer
-from scilab_rl.visualization.records import ClipInfo, Record, encode_picture
-from scilab_rl.workspace import open_desk
+from scilab_rl.config.compose import compose
+from scilab_rl.config.workspace import open_project
+from scilab_rl.recording.callback import Recording
+from scilab_rl.recording.live import LOOPBACK, LiveViewer, free_port, start_viewer
+from scilab_rl.recording.records import ClipInfo, Record, encode_picture
+from scilab_rl.run.checks import complete
+from scilab_rl.run.directory import RunDirectory
+from scilab_rl.run.run import build_session
+from scilab_rl.training.callbacks import RunCallback
 
 FOUR = "render_metrics_test=[q_value,critic_variance,goal_distance,reward]"
 FOUR_TRAIN = "render_metrics_train=[q_value,critic_variance,goal_distance,reward]"
@@ -47,16 +50,15 @@ N_PAIRS = 48  # of windows, per viewer
 
 def main() -> None:
     """Measure everything and print it."""
-    open_desk()
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        result = {
-            "unwatched_share": unwatched_share(),
-            "bare_frames_per_second": bare_frames_per_second(),
-            "shown_frames_per_second": shown_frames_per_second(),
-            "running_viewer": speed_with_viewer(stuck=False),
-            "stuck_viewer": speed_with_viewer(stuck=True),
-            "load_average": os.getloadavg()[0],
-        }
+    open_project()
+    result = {
+        "unwatched_share": unwatched_share(),
+        "bare_frames_per_second": bare_frames_per_second(),
+        "shown_frames_per_second": shown_frames_per_second(),
+        "running_viewer": speed_with_viewer(stuck=False),
+        "stuck_viewer": speed_with_viewer(stuck=True),
+        "load_average": os.getloadavg()[0],
+    }
     text = json.dumps(result, indent=2) + "\n"
     sys.stdout.write(text)
     for path in sys.argv[1:]:
@@ -67,7 +69,7 @@ def unwatched_share() -> float:
     """Return the share of a training step that goes into observers while nothing is shown."""
     session = make_session("env=FetchReach", "render=record", FOUR, FOUR_TRAIN)
     session.algorithm.learning_starts = 60
-    train = session.showing.train
+    train = recording_of(session).train
     spent = 0.0
 
     def timed(method: Any) -> Any:
@@ -110,7 +112,7 @@ def shown_frames_per_second() -> float:
     rates = []
     for _ in range(REPEATS):
         session = make_session("env=FetchPush", "render=record", FOUR)
-        session.showing.evaluation.show(1, 2)
+        recording_of(session).evaluation.show(1, 2)
         started = time.perf_counter()
         evaluate(session.algorithm, session.eval_env, 2, seed=1)
         rates.append(100 / (time.perf_counter() - started))
@@ -124,14 +126,15 @@ def speed_with_viewer(*, stuck: bool) -> dict[str, Any]:
         "env=FetchReach", "render=display", FOUR_TRAIN, "eval_after_n_steps=1000000"
     )
     session.algorithm.learning_starts = 10**9
-    viewer = session.showing.sinks[0]
+    recording = recording_of(session)
+    viewer = recording.sinks[0]
     reader = connect_reader(viewer)
     if stuck:
         os.kill(reader.pid, signal.SIGSTOP)
         fill_buffers(viewer)
-    windows = Windows(session.showing.train, viewer, wait=not stuck)
-    session.trainer.after_step.append(windows.after_step)
-    session.showing.train.show(1, 10**9)
+    windows = Windows(recording.train, viewer, wait=not stuck)
+    session.trainer.callbacks.insert(1, windows)
+    recording.train.show(1, 10**9)
     session.algorithm.learn((2 * N_PAIRS + 1) * EPISODE, callback=session.trainer)
     reader.kill()
     reader.wait()
@@ -159,7 +162,7 @@ def fill_buffers(viewer: LiveViewer) -> None:
         time.sleep(0.005)
 
 
-class Windows:
+class Windows(RunCallback):
     """Times episodes while a viewer and nobody take turns in the order A B B A.
 
     Args:
@@ -169,6 +172,7 @@ class Windows:
     """
 
     def __init__(self, timeline: Any, viewer: Any, *, wait: bool) -> None:
+        super().__init__()
         self.timeline = timeline
         self.takers = {False: _Nobody(), True: viewer}
         self.viewer = viewer
@@ -178,12 +182,12 @@ class Windows:
         self._order = [False, *[False, True, True, False] * (N_PAIRS // 2), False]
         self._started = (0.0, 0.0)
 
-    def after_step(self) -> None:
+    def _on_step(self) -> bool:
         """Count; between two episodes change the taker."""
         self._n_steps += 1
         window, step = divmod(self._n_steps, EPISODE)
         if step:
-            return
+            return True
         wall, cpu = self._started
         if window > 1:  # the first one warms up
             times = (time.perf_counter() - wall, time.process_time() - cpu)
@@ -192,6 +196,7 @@ class Windows:
             time.sleep(0.01)
         self.timeline.sinks = [self.takers[self._order[window]]]
         self._started = (time.perf_counter(), time.process_time())
+        return True
 
     def result(self) -> dict[str, Any]:
         """Return relative speeds, by wall clock and by processor time."""
@@ -228,16 +233,21 @@ def make_session(*overrides: str) -> Any:
     """Build a run in a temporary folder."""
     base = Path(tempfile.mkdtemp())
     given = [*overrides, "algorithm=cleansac", "mlflow=0", "seed=1", f"base_logdir={base}"]
-    cfg = assembly.complete(config.compose([*given, "++algorithm.buffer_size=10000"]))
+    cfg = complete(compose([*given, "++algorithm.buffer_size=10000"]))
     directory = RunDirectory.create(base, cfg.env, "bench", 1)
-    session = experiment.build(cfg, directory)
+    session = build_session(cfg, directory)
     session.trackers.trackers.clear()
     return session
 
 
+def recording_of(session: Any) -> Recording:
+    """Return what shows the episodes of a session."""
+    return next(c for c in session.trainer.callbacks if isinstance(c, Recording))
+
+
 def close(session: Any) -> None:
     """End what a session has opened."""
-    session.showing.close()
+    session.trainer.close()
     session.train_env.close()
     session.eval_env.close()
 

@@ -1,7 +1,7 @@
 """Environment steps per second of runs that learn, ours beside those of others.
 
 Everybody trains soft actor-critic on FetchReach-v4, one update per environment step, batches of
-256, layers of [256, 256], hindsight with four relabelled transitions per original one (CleanRL has
+256, layers of [256, 256], hindsight with four relabeled transitions per original one (CleanRL has
 none). A step counts with all that belongs to it: acting, simulating, storing, sampling, updating.
 Our runs are whole runs with all their files, of which only the evaluation is taken off. They and
 their peers, which are in a virtual environment of their own, take turns of some hundred steps in

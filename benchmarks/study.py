@@ -30,14 +30,15 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from scilab_rl.hyperopt import worker
-from scilab_rl.hyperopt.ledger import Ledger
-from scilab_rl.hyperopt.pool import Pool, n_cores
-from scilab_rl.hyperopt.runs import RUNNING, Run
-from scilab_rl.hyperopt.settings import read_settings
-from scilab_rl.hyperopt.space import Parameter, SearchSpace
-from scilab_rl.hyperopt.study import RunPlan, Study
-from scilab_rl.hyperopt.worker import Message, Task
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.parallel import worker
+from scilab_rl.parallel.pool import Pool, n_cores
+from scilab_rl.parallel.worker import Message, Task
+from scilab_rl.search.runs import RUNNING, Run
+from scilab_rl.search.settings import read_settings
+from scilab_rl.search.space import Parameter, SearchSpace
+from scilab_rl.search.storage import StudyStorage
+from scilab_rl.search.study import RunPlan, Study
 
 SECONDS = (3.0, 6.0, 9.0, 12.0, 15.0)
 N_WAITING, N_TRAININGS, N_WORKERS = 40, 12, 4  # waiting needs no core, so four at a time
@@ -139,9 +140,9 @@ def work(
     settings = read_settings(
         {"max_trials": count, "min_trials_per_param": 2, "n_final_runs": 0, "pruner": "none"}
     )
-    plan = RunPlan(fixed, "eval/success_rate", epochs, 200 * epochs, 0.9, seed=1)
+    plan = RunPlan(fixed, RunConfig(n_epochs=epochs, eval_after_n_steps=200), seed=1)
     clock = Clock()
-    study = Study(Ledger(folder), pool, space, settings, plan, clock)
+    study = Study(StudyStorage(folder), pool, space, settings, plan, clock.update)
     study.work()
     return study.runs, clock
 

@@ -23,7 +23,7 @@ import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from scilab_rl.results import RunDirectory, read_epochs
+from scilab_rl.run.directory import RunDirectory, read_epochs
 
 ROOT = Path(__file__).parents[1]
 THRESHOLD, IN_A_ROW, EPISODES = 0.9, 3, 20

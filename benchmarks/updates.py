@@ -33,16 +33,16 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import hydra
 import numpy as np
 import torch
 from participants import Peer, peers_are_installed
 from torch.profiler import ProfilerActivity, profile
 from turns import publish, take_turns, timed
 
-from scilab_rl import assembly, config
+from scilab_rl.config.compose import compose
+from scilab_rl.config.workspace import open_project
 from scilab_rl.envs.vectorize import make_train_env
-from scilab_rl.workspace import open_desk
+from scilab_rl.run.parts import make_algorithm
 
 PEER = "stable-baselines3"
 SBX = "sbx"
@@ -105,7 +105,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=N_STEPS, help="recorded; default 5000")
     parser.add_argument("--json", type=Path, help="also write the JSON object to this file")
     arguments = parser.parse_args()
-    open_desk()
+    open_project()
     entries = [entry for entry in ENTRIES if not arguments.only or entry.name in arguments.only]
     if not peers_are_installed():
         entries = [entry for entry in entries if entry.script is None]
@@ -178,7 +178,7 @@ def prepare(
     architecture = f"algorithm.policy_kwargs={{net_arch:{layers}}}" if is_peer else ""
     overrides = [*entry.overrides, architecture or f"algorithm.net_arch={layers}"]
     cfg = configure(*overrides, f"algorithm.batch_size={batch_size}")
-    algorithm = assembly.make_algorithm(cfg, make_train_env(assembly.env_settings(cfg)))
+    algorithm = make_algorithm(cfg, make_train_env(cfg))
     for step in steps:
         algorithm.replay_buffer.add(*step)
     if is_peer:
@@ -186,20 +186,12 @@ def prepare(
 
         algorithm.set_logger(MetricLogger())
         return lambda: algorithm.train(entry.updates_per_call, batch_size)
-    if not hasattr(algorithm, "rounds"):
-        return lambda: algorithm.train(entry.updates_per_call)
-    algorithm.gradient_steps = entry.updates_per_call
-
-    def update_round() -> None:
-        algorithm.rounds.start(algorithm.draw())
-        algorithm.finish_round()
-
-    return update_round
+    return lambda: algorithm.train(entry.updates_per_call)
 
 
 def configure(*overrides: str) -> Any:
     """Return the configuration of a run on FetchReach without anybody's tuned values."""
-    return config.compose([*overrides, "env=FetchReach", "seed=1", "tuned=false"])
+    return compose([*overrides, "env=FetchReach", "seed=1", "tuned=false"])
 
 
 def peer_process(
@@ -228,7 +220,7 @@ def written(steps: list[Step]) -> Iterator[Path]:
 
 def recorded_steps(n: int) -> list[Step]:
     """Return the same steps with random actions for everybody, as arguments of ``add``."""
-    return list(random_steps(make_train_env(assembly.env_settings(configure())), n))
+    return list(random_steps(make_train_env(configure()), n))
 
 
 def random_steps(env: Any, n: int) -> Iterator[Step]:
@@ -339,5 +331,4 @@ def table(batch_size: int, net_arch: Sequence[int], results: Results) -> str:
 
 
 if __name__ == "__main__":
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        main()
+    main()

@@ -21,8 +21,9 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
+from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs.fingerprint import scripted_action
-from scilab_rl.envs.vectorize import EnvSettings, make_single_env
+from scilab_rl.envs.vectorize import make_single_env
 
 TARGET = Path(__file__).parent / "images" / "environments.png"
 MYOSUITE_PYTHON = Path(__file__).parents[1] / ".venv-myosuite" / "bin" / "python"
@@ -57,7 +58,7 @@ MYOSUITE = ["myoElbowPose1D6MRandom-v0", "myoHandReachRandom-v0"]
 
 def frame_of(env_id: str) -> np.ndarray:
     """Return the frame after some random steps."""
-    env = make_single_env(EnvSettings(env_id, render_mode="rgb_array"))
+    env = make_single_env(RunConfig(env_id), "rgb_array")
     rng = np.random.default_rng(0)
     env.reset(seed=3)
     for _ in range(N_STEPS):

@@ -9,6 +9,7 @@ import contextlib
 import importlib
 import inspect
 import io
+import itertools
 import json
 import os
 import re
@@ -18,21 +19,23 @@ from types import ModuleType
 from typing import Any
 
 import yaml
-from omegaconf import OmegaConf
 
-from scilab_rl import config
-from scilab_rl.cli import COMMANDS, run_command_line
-from scilab_rl.commands import envs, help
-from scilab_rl.commands.tables import as_typed
+from scilab_rl.cli.main import COMMANDS, run_command_line
+from scilab_rl.cli.tables import as_typed
+from scilab_rl.config.schema import ALIASES, CONDITIONS, KEYS, Key
+from scilab_rl.config.workspace import SHIPPED_CONF, config_files
+from scilab_rl.envs import catalog
+from scilab_rl.learning.declared import declared_metrics
 from scilab_rl.metrics import probes
-from scilab_rl.workspace import SHIPPED_CONF, config_files
+from scilab_rl.metrics.names import FRAMEWORK_METRICS, INTRINSIC_METRICS
 
 # What people subclass, call or read, by page section.
 API = {
     "Algorithms": (
-        "scilab_rl.algorithms.base.OneFileAlgorithm",
-        "scilab_rl.algorithms.base.Step",
-        "scilab_rl.algorithms.replay.HindsightReplayBuffer",
+        "scilab_rl.learning.base.OneFileAlgorithm",
+        "scilab_rl.learning.off_policy.OffPolicyAlgorithm",
+        "scilab_rl.envs.vec_step.VecStep",
+        "scilab_rl.learning.replay.HindsightReplayBuffer",
         "scilab_rl.algorithms.intrinsic.base.IntrinsicReward",
         "scilab_rl.testing.algorithms.AlgorithmContract",
     ),
@@ -44,9 +47,13 @@ API = {
     "Metrics and trackers": (
         "scilab_rl.metrics.logger.MetricLogger",
         "scilab_rl.tracking.base.Tracker",
-        "scilab_rl.tracking.base.RunInfo",
+        "scilab_rl.tracking.base.TrackedRun",
     ),
-    "Runs": ("scilab_rl.experiment.run", "scilab_rl.results.RunResult"),
+    "Runs": (
+        "scilab_rl.config.schema.RunConfig",
+        "scilab_rl.run.run.start_run",
+        "scilab_rl.results.RunResult",
+    ),
 }
 BASELINES = Path(__file__).parents[1] / "baselines"
 _SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Shapes")
@@ -63,6 +70,11 @@ def on_files(files: Any, config: Any) -> Any:
     return files
 
 
+def on_page_markdown(markdown: str, **_: object) -> str:
+    """Insert generated tables where a page has their mark; called by MkDocs."""
+    return markdown.replace("<!-- generated: learned -->", "\n".join(learned_table()))
+
+
 def keys_page() -> Iterator[str]:
     """Yield the page of all configuration keys, from the schema that checks them."""
     yield "# Configuration keys\n"
@@ -71,23 +83,21 @@ def keys_page() -> Iterator[str]:
         "(`n_epochs=3`) or in a [file of your own](../howto/configuration.md). "
         "`scilab-rl explain KEY` tells where a value came from.\n"
     )
-    main = OmegaConf.load(SHIPPED_CONF / "main.yaml")
-    for heading, names in help._headings().items():
+    for heading, keys in itertools.groupby(KEYS, key=lambda key: key.heading):
         rows = [
             (
                 f"`{key.name}`",
-                f"{_literal(key.meaning)}: `{as_typed(main[key.name])}` ({_allowed(key)})",
+                f"{_literal(key.meaning)}: `{as_typed(key.default)}` ({_allowed(key)})",
             )
-            for key in config.KEYS
-            if key.name in names
+            for key in keys
         ]
         yield f"## {heading}\n"
         yield from table(("key", "meaning: default (what is allowed)"), rows)
     yield "## Wrappers\n"
     yield "With a plus, because they are not in `main.yaml`:\n"
-    yield from (f"* `+{alias}=1`" for alias in config.ALIASES)
+    yield from (f"* `+{alias}=1`" for alias in ALIASES)
     yield "\n## What a run of a performance test has to reach\n"
-    yield f"`{config.CONDITIONS}`, see [the how-to](../howto/testing.md).\n"
+    yield f"`{CONDITIONS}`, see [the how-to](../howto/testing.md).\n"
 
 
 def commands_page() -> Iterator[str]:
@@ -134,10 +144,10 @@ def environments_page() -> Iterator[str]:
         "[Pictures](../gallery.md). `scilab-rl envs NAME` shows one in detail.\n"
     )
     yield "## Packages\n"
-    suites = envs.list_suites()
-    columns = ("suite", "brings", "install", "conflicts", "note")
+    suites = catalog.list_suites()
+    columns = ("suite", "contents", "install", "conflicts", "note")
     yield from table(columns, [[str(s[c] or "") for c in columns] for s in suites])
-    rows = envs.list_all()
+    rows = catalog.list_all()
     for suite in suites:
         own = [row for row in rows if row["suite"] == suite["suite"]]
         if own:
@@ -174,14 +184,22 @@ def metrics_page() -> Iterator[str]:
     yield "## What each algorithm records\n"
     rows = []
     for name, path in config_files("algorithm").items():
-        module = _try_import(
-            yaml.safe_load(path.read_text(encoding="utf-8"))["_target_"].rpartition(".")[0]
+        module_name, _, cls_name = yaml.safe_load(path.read_text(encoding="utf-8"))[
+            "_target_"
+        ].rpartition(".")
+        if (module := _try_import(module_name)) is None:
+            continue
+        metrics = declared_metrics(getattr(module, cls_name))
+        said = (
+            f"`{m.name}`" + (f" (only when {m.condition})" if m.condition else "") for m in metrics
         )
-        said = re.search(r"Metrics: (.*?)(?:\n\n|\Z)", (module and module.__doc__) or "", re.S)
-        if said:
-            rows.append((f"`{name}`", " ".join(said[1].split())))
+        rows.append((f"`{name}`", ", ".join(said) or "nothing"))
     yield from table(("algorithm", "metrics"), rows)
-    yield "Those of Stable-Baselines3 record what its documentation says, under the same names.\n"
+    yield "Every run has, besides: " + ", ".join(f"`{n}`" for n in FRAMEWORK_METRICS) + ".\n"
+    yield (
+        "With an intrinsic reward: `train/intrinsic_reward`, `train/intrinsic_loss` (where it "
+        "learns models), " + ", ".join(f"`{n}`" for n in INTRINSIC_METRICS) + ".\n"
+    )
 
 
 def search_page() -> Iterator[str]:
@@ -201,28 +219,28 @@ def search_page() -> Iterator[str]:
         yield from fenced("yaml", path.read_text(encoding="utf-8"))
 
 
-def baselines_page() -> Iterator[str]:
-    """Yield what the performance tests were passed with, from the stored baselines."""
-    yield "# What has been learned"
-    yield ""
-    yield "The [performance tests](../howto/testing.md) whose results are kept in `baselines/`."
-    yield "*Mean* is that over the runs, each judged in 100 episodes of its own after training; its"
-    yield "interval holds at any moment of stopping."
-    yield ""
+def learned_table() -> Iterator[str]:
+    """Yield the results of all performance tests that have a baseline, by environment."""
     rows = []
-    for path in sorted(BASELINES.rglob("*.json")):
+    for path in BASELINES.glob("*/*.json"):
         result = json.loads(path.read_text(encoding="utf-8"))
-        verdict, asked = result["verdict"], result["definition"]["conditions"]
+        verdict, target = result["verdict"], result["definition"]["conditions"]
+        configuration = result["definition"]["configuration"]
         steps = sorted(run["steps"] for run in result["runs"])
         rows.append((
-            f"`{result['name']}`",
-            f"{asked['eval_value']:g} within {asked['max_steps']:,}",
+            f"`{json.loads(configuration['env'])}`",
+            f"`{json.loads(configuration['algorithm.name'])}`",
+            target["eval_columns"].removeprefix("eval/").replace("_", " "),
+            f"{target['eval_value']:g} within {target['max_steps']:,} steps",
             f"{verdict['mean']:.3g} [{verdict['low']:.3g}, {verdict['high']:.3g}]",
+            verdict["outcome"],
             verdict["n_runs"],
             f"{steps[0]:,} to {steps[-1]:,}",
+            f"`{result['name']}`",
             result["date"],
         ))  # fmt: skip
-    yield from table(("Test", "Needed", "Mean", "Runs", "Steps", "Date"), rows)
+    columns = ("environment", "algorithm", "metric", "target", "result", "outcome", "runs", "steps")
+    yield from table((*columns, "performance test", "date"), sorted(rows))
 
 
 def api_page() -> Iterator[str]:
@@ -309,10 +327,9 @@ def _literal(text: str) -> str:
     return re.sub(r"\b_\w+_\b", r"`\g<0>`", text)
 
 
-def _allowed(key: config.Key) -> str:
-    words = "0, 1" if key.kind == config.SWITCH else "" if key.choices else key.kind
-    listed = [word for word in (words, *map(str, key.choices), "null" * key.optional) if word]
-    return f"{', '.join(listed)}{f', from {key.low:g}' if key.low > float('-inf') else ''}"
+def _allowed(key: Key) -> str:
+    words = [*key.allowed, *["null"] * key.optional]
+    return f"{', '.join(words)}{f', from {key.low:g}' if key.low > float('-inf') else ''}"
 
 
 def _short_signature(function: Callable[..., Any]) -> str:
@@ -334,6 +351,5 @@ PAGES: dict[str, Callable[[], Iterator[str]]] = {
     "environments": environments_page,
     "metrics": metrics_page,
     "search": search_page,
-    "baselines": baselines_page,
     "api": api_page,
 }

@@ -24,7 +24,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from scilab_rl.performance.estimates import curve_band
+from scilab_rl.analysis.estimates import curve_band
 
 
 def main() -> None:

@@ -19,14 +19,15 @@ from typing import Any
 import numpy as np
 from scipy.stats import wilcoxon
 
-from scilab_rl import assembly
-from scilab_rl.algorithms.inspection import Inspection
-from scilab_rl.config import load_recorded
+from scilab_rl.config.recorded import load_recorded
+from scilab_rl.config.workspace import open_project
 from scilab_rl.envs.vectorize import make_eval_env
-from scilab_rl.results import CONFIG_FILE, find_run
-from scilab_rl.training.trainer import load_policy
-from scilab_rl.visualization.gl import choose_backend
-from scilab_rl.workspace import open_desk
+from scilab_rl.learning.inspector import AgentInspector
+from scilab_rl.recording.gl import choose_backend
+from scilab_rl.run.checks import complete, prepare_torch
+from scilab_rl.run.directory import CONFIG_FILE, find_run
+from scilab_rl.run.parts import make_algorithm
+from scilab_rl.training.policy import load_policy
 
 STEPS_PER_EPISODE = 120
 WINDOW = 10  # steps before and after the fall
@@ -61,7 +62,7 @@ class ScriptedPush:
 def main() -> None:
     """Measure, draw, and print the table."""
     options = _parse()
-    open_desk()
+    open_project()
     run = find_run(options.run, options.base_logdir)
     env, model = _agent(run)
     falls: list[dict[str, Any]] = []
@@ -90,24 +91,24 @@ def _parse() -> argparse.Namespace:
 
 
 def _agent(run: Any) -> tuple[Any, Any]:
-    cfg = assembly.complete(load_recorded(run / CONFIG_FILE))
-    assembly.prepare_torch(cfg)
+    cfg = complete(load_recorded(run / CONFIG_FILE))
+    prepare_torch(cfg)
     choose_backend()
-    settings = dataclasses.replace(
-        assembly.env_settings(cfg),
+    arguments = {**cfg.algorithm.arguments, "buffer_size": 1000}
+    cfg = dataclasses.replace(
+        cfg,
         env_kwargs={"max_episode_steps": STEPS_PER_EPISODE},
-        render_mode="rgb_array",
+        algorithm=dataclasses.replace(cfg.algorithm, arguments=arguments),
     )
-    env = make_eval_env(settings)
-    cfg.algorithm.buffer_size = 1000
-    model = assembly.make_algorithm(cfg, env)
+    env = make_eval_env(cfg, "rgb_array")
+    model = make_algorithm(cfg, env)
     load_policy(model, run / "rl_model_finished")
     return env, model
 
 
 def _push_once(env: Any, model: Any, seed: int, with_frames: bool) -> dict[str, Any] | None:
     """Push in one episode; return what happened around the fall, or None when nothing fell."""
-    mind, script = Inspection(model), ScriptedPush()
+    inspector, script = AgentInspector(model), ScriptedPush()
     env.seed(seed)
     observations = env.reset()
     resting = observations["observation"][0][BLOCK][2]
@@ -118,7 +119,7 @@ def _push_once(env: Any, model: Any, seed: int, with_frames: bool) -> dict[str, 
         action = script.act(observation["observation"])
         wanted, _ = model.predict(observation, deterministic=True)
         for name, considered in (("executed", action), ("policy", wanted)):
-            variances[name].append(float(np.var(mind.q_values(observation, considered))))
+            variances[name].append(float(np.var(inspector.q_values(observation, considered))))
         if with_frames:
             frames.append(env.envs[0].render())
         if fell_at is None and observation["observation"][BLOCK][2] < resting - FALL_BEGINS_METRES:
@@ -171,14 +172,14 @@ def _draw(falls: list[dict[str, Any]], result: dict[str, Any], path: Path) -> No
         axis.set_title(title, fontsize=10)
         axis.axis("off")
     steps = np.arange(-WINDOW, WINDOW + 1)
-    for name, label, colour in (
+    for name, label, color in (
         ("policy", "for the agent's own action", "#1f5fbf"),
         ("executed", "for the scripted action", "#c2571a"),
     ):
         around = np.array([_around(fall, name) for fall in falls])
         low, middle, high = np.quantile(around, [0.25, 0.5, 0.75], axis=0)
-        axes[3].plot(steps, middle, color=colour, label=label)
-        axes[3].fill_between(steps, low, high, color=colour, alpha=0.2, linewidth=0)
+        axes[3].plot(steps, middle, color=color, label=label)
+        axes[3].fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
     axes[3].axvline(0, color="grey", linewidth=1)
     axes[3].set_xlabel("steps from the fall")
     title = f"critic variance, median and quartiles of {result['falls']} falls"

@@ -23,7 +23,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 import yaml
 
-from scilab_rl.results import CONFIG_FILE, all_runs, read_epochs
+from scilab_rl.run.directory import CONFIG_FILE, all_runs, read_epochs
 
 TARGET = Path(__file__).parents[1] / "docs" / "images" / "environments_learning.png"
 N_COLUMNS = 4

@@ -12,8 +12,7 @@ from __future__ import annotations
 import json
 import sys
 
-from scilab_rl.commands.envs import describe
-from scilab_rl.envs.recorded import SPACES
+from scilab_rl.envs.catalog import SPACES, describe
 from scilab_rl.envs.registration import known_env_ids, versions_by_family
 
 KEPT = ("observation", "action", "goal")

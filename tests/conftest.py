@@ -1,7 +1,9 @@
 """What holds for all tests."""
 
+import logging
 import os
 import signal
+from collections.abc import Iterator
 
 import pytest
 
@@ -15,5 +17,15 @@ for name in ("WANDB_API_KEY", "MLFLOW_TRACKING_URI"):
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The exam lives in the package; its failures shall show values as those of test files do.
+# The contract test lives in the package; its failures must show values like those of test files.
 pytest.register_assert_rewrite("scilab_rl.testing.algorithms")
+
+
+@pytest.fixture(autouse=True)
+def _messages_as_before() -> Iterator[None]:
+    """The command line sets up the package's messages; the next test must not see that."""
+    logger = logging.getLogger("scilab_rl")
+    handlers, level, propagate = list(logger.handlers), logger.level, logger.propagate
+    yield
+    logger.handlers[:], logger.propagate = handlers, propagate
+    logger.setLevel(level)

@@ -22,7 +22,7 @@ from tianshou.utils.net.continuous import ContinuousActorProbabilistic, Continuo
 BUFFER_SIZE = 1_000_000
 LEARNING_RATE = 3e-4
 N_RANDOM = 100  # steps before the first update
-# One of five episodes keeps its goal, as with four relabelled transitions per original one.
+# One of five episodes keeps its goal, as with four relabeled transitions per original one.
 FUTURE_K = 5
 
 

@@ -1,6 +1,6 @@
 """Draw the figures of the pages under *Understand* into docs/images/.
 
-python -m docs.figures [--train]: with ``--train``, the learning curves are trained anew (some
+python -m docs.figures [--train]: with ``--train``, the learning curves are trained again (some
 minutes); else they are drawn from docs/figures/curves.json.
 """
 
@@ -17,17 +17,17 @@ import matplotlib
 matplotlib.use("Agg")
 
 import gymnasium as gym
-import hydra
 import matplotlib.pyplot as plt
 import numpy as np
 import torch
 from matplotlib.axes import Axes
+from scipy.stats import binomtest
 from torch import nn
 
-from scilab_rl import config, experiment
+from scilab_rl.config.compose import compose, friendly_override
 from scilab_rl.envs.templates.minimal import MyTask
 from scilab_rl.metrics.success import success_of
-from scilab_rl.training.evaluation import wilson_interval
+from scilab_rl.run.run import start_run
 
 IMAGES = Path(__file__).parents[1] / "images"
 CURVES = Path(__file__).parent / "curves.json"
@@ -46,8 +46,8 @@ def figure_gamma() -> None:
     """What a reward in the future is worth."""
     figure, axes = new_axes("steps until the reward", "what it is worth now")
     steps = np.arange(101)
-    for gamma, colour in ((0.9, GREY), (0.95, ORANGE), (0.99, BLUE)):
-        axes.plot(steps, gamma**steps, color=colour, label=f"γ = {gamma}")
+    for gamma, color in ((0.9, GREY), (0.95, ORANGE), (0.99, BLUE)):
+        axes.plot(steps, gamma**steps, color=color, label=f"γ = {gamma}")
     axes.legend(frameon=False, loc="upper right")
     axes.set_ylim(0, 1.02)
     save(figure, "gamma")
@@ -57,10 +57,11 @@ def figure_interval() -> None:
     """How much the success of n episodes says."""
     figure, axes = new_axes("episodes played", "success rate: 95 % interval")
     counts = np.arange(5, 201, 5)
-    for rate, colour in ((0.8, ORANGE), (1.0, BLUE)):
-        bounds = np.array([wilson_interval(round(rate * n), int(n)) for n in counts])
-        axes.fill_between(counts, bounds[:, 0], bounds[:, 1], color=colour, alpha=0.25, lw=0)
-        axes.axhline(rate, color=colour)
+    for rate, color in ((0.8, ORANGE), (1.0, BLUE)):
+        tests = [binomtest(round(rate * n), int(n)) for n in counts]
+        bounds = np.array([test.proportion_ci(method="wilson") for test in tests])
+        axes.fill_between(counts, bounds[:, 0], bounds[:, 1], color=color, alpha=0.25, lw=0)
+        axes.axhline(rate, color=color)
         axes.annotate(f"{rate:.0%} seen", (160, rate), (0, -14), textcoords="offset points")
     axes.set_ylim(0.3, 1.02)
     save(figure, "interval")
@@ -101,7 +102,7 @@ def fit(x: torch.Tensor, y: torch.Tensor) -> nn.Module:
 
 
 def figure_her() -> None:
-    """An episode that missed its goal, and the same episode relabelled."""
+    """An episode that missed its goal, and the same episode relabeled."""
     env = MyTask()
     observation, _ = env.reset(seed=4)
     env.goal = np.array([0.75, 0.65], dtype=np.float32)
@@ -134,11 +135,11 @@ def figure_her_learning() -> None:
     """The same agent with and without hindsight."""
     curves = json.loads(CURVES.read_text(encoding="utf-8"))
     figure, axes = new_axes("training steps", "success rate")
-    for name, colour in (("with hindsight", BLUE), ("without", ORANGE)):
+    for name, color in (("with hindsight", BLUE), ("without", ORANGE)):
         values = np.array(curves[name])
         for run in values:
-            axes.plot(curves["steps"], run, color=colour, alpha=0.2, lw=1)
-        axes.plot(curves["steps"], values.mean(axis=0), color=colour, lw=2.5, label=name)
+            axes.plot(curves["steps"], run, color=color, alpha=0.2, lw=1)
+        axes.plot(curves["steps"], values.mean(axis=0), color=color, lw=2.5, label=name)
     axes.set_ylim(-0.02, 1.02)
     axes.legend(frameon=False, title=f"point task, mean of {N_SEEDS} runs")
     save(figure, "her_learning")
@@ -169,9 +170,8 @@ def train_curves() -> None:
 
 def success_rates(seed: int, *overrides: str) -> list[float]:
     """Train once and return the success rate after each epoch."""
-    words = [config.friendly_override(w) for w in (*TRAINING, f"seed={seed}", *overrides)]
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        result = experiment.run(config.compose(words), words)
+    words = [friendly_override(w) for w in (*TRAINING, f"seed={seed}", *overrides)]
+    result = start_run(compose(words), words)
     lines = (Path(result.run_dir) / "metrics.csv").read_text(encoding="utf-8").splitlines()
     column = lines[0].split(",").index("eval/success_rate")
     return [float(line.split(",")[column]) for line in lines[1:]]

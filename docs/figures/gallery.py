@@ -14,9 +14,9 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-from scilab_rl.cli import run_command_line
-from scilab_rl.visualization.archive import load_clip
-from scilab_rl.visualization.movie import MovieFrames
+from scilab_rl.cli.main import run_command_line
+from scilab_rl.recording.movie import MovieFrames
+from scilab_rl.recording.records import load_clip
 
 FILMS = Path("data/gallery")
 PICTURES = Path(__file__).parents[1] / "images" / "gallery"

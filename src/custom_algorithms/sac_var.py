@@ -6,7 +6,7 @@ The example of the Scilab-RL paper, section "Illustrative example"; a copy of cl
     r = (1 - eta) r_e + eta r_i,        eta = ``weight_critic_var``.
 
 Haarnoja et al., 2018, "Soft Actor-Critic Algorithms and Applications", arXiv 1812.05905; HER:
-Andrychowicz et al., 2017, arXiv 1707.01495. The agent maximises reward plus entropy,
+Andrychowicz et al., 2017, arXiv 1707.01495. The agent maximizes reward plus entropy,
 E[sum_t gamma^t (r_t + alpha H(pi(.|s_t)))]. An update takes a batch (s, a, r, s', d) from the
 replay buffer and does, in this order:
 
@@ -20,20 +20,14 @@ where a~ = tanh(mu(s) + sigma(s) eps) and a' are fresh actions of the policy.
 
 What differs from the paper: any number of critics (``n_critics``), computed as one batched matrix
 product; log alpha is learned instead of alpha, as in the authors' code.
-
-Metrics: train/critic_loss, train/actor_loss, train/ent_coef, train/ent_coef_loss,
-train/critic_variance, train/intrinsic_reward, and per environment step train/rollout_q_step,
-train/rollout_logpi_step and, on demand, train/rollout_obs_step_<i>, train/rollout_act_step_<i>.
 """
 
 from __future__ import annotations
 
 import copy
-import itertools
 import math
-from collections import defaultdict
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from functools import partial
 from typing import Any
 
@@ -41,19 +35,27 @@ import numpy as np
 import torch
 import torch.nn.functional as F
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
-from torch import Tensor, nn
+from stable_baselines3.common.type_aliases import ReplayBufferSamples
+from torch import Tensor
 
-from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm
 from scilab_rl.algorithms.intrinsic.build import make_intrinsic_reward
+from scilab_rl.envs.types import Observation
+from scilab_rl.learning.base import LazyNumber
+from scilab_rl.learning.nn import (
+    Autocast,
+    Critics,
+    GaussianNetwork,
+    autocast_to,
+    critic_variance,
+    gradient_step,
+    update_target,
+)
+from scilab_rl.learning.off_policy import OffPolicyAlgorithm
 
-LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
-Autocast = Callable[[], AbstractContextManager[Any]]
+LOG_STD_RANGE = (-20.0, 2.0)
 
 
-class Actor(nn.Module):
+class Actor(GaussianNetwork):
     """The policy: a normal distribution whose samples are squashed into [-scale, scale].
 
     Args:
@@ -75,20 +77,8 @@ class Actor(nn.Module):
         scale: float,
         autocast: Autocast = nullcontext,
     ) -> None:
-        super().__init__()
-        layers: list[nn.Module] = []
-        for n_in, n_out in itertools.pairwise([n_observations, *net_arch]):
-            layers += [nn.Linear(n_in, n_out), nn.ReLU()]
-        self.net = nn.Sequential(*layers, nn.Linear([n_observations, *net_arch][-1], 2 * n_actions))
+        super().__init__([n_observations, *net_arch, n_actions], LOG_STD_RANGE, autocast)
         self.scale = scale
-        self.autocast = autocast
-
-    def forward(self, observations: Tensor) -> tuple[Tensor, Tensor]:
-        """Return mean and logarithm of the standard deviation, before squashing."""
-        with self.autocast():
-            parameters = self.net(observations)
-        mean, log_std = parameters.float().chunk(2, dim=-1)
-        return mean, log_std.clamp(LOG_STD_MIN, LOG_STD_MAX)
 
     def sample(self, observations: Tensor) -> tuple[Tensor, Tensor]:
         """Draw actions that gradients can flow through; return them and their log probabilities."""
@@ -111,55 +101,10 @@ class Actor(nn.Module):
         return self.scale * torch.tanh(self(observations)[0])
 
 
-class Critics(nn.Module):
-    """``n_critics`` independent action-value functions, all in one batched matrix product.
-
-    Shapes:
-        observations: ``(batch, n_observations)``; actions: ``(batch, n_actions)``;
-        result: ``(batch, n_critics)``; weights: ``(n_critics, n_in, n_out)``.
-    """
-
-    def __init__(
-        self,
-        n_observations: int,
-        n_actions: int,
-        net_arch: Sequence[int],
-        n_critics: int,
-        autocast: Autocast = nullcontext,
-    ) -> None:
-        super().__init__()
-        self.autocast = autocast
-        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
-        for n_in, n_out in itertools.pairwise([n_observations + n_actions, *net_arch, 1]):
-            bound = 1 / math.sqrt(n_in)  # the initialisation of torch.nn.Linear
-            self.weights.append(torch.empty(n_critics, n_in, n_out).uniform_(-bound, bound))
-            self.biases.append(torch.empty(n_critics, 1, n_out).uniform_(-bound, bound))
-
-    def forward(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Return the value that each critic gives to each pair."""
-        inputs = torch.cat([observations, actions], dim=1)
-        hidden = inputs.expand(len(self.weights[0]), *inputs.shape)
-        *hidden_layers, (last_weight, last_bias) = zip(self.weights, self.biases, strict=True)
-        with self.autocast():
-            for weight, bias in hidden_layers:
-                hidden = F.relu_(torch.baddbmm(bias, hidden, weight))
-        # The last layer has one output: a sum is faster than a matrix product of one column.
-        return ((hidden * last_weight.mT).sum(dim=-1) + last_bias.squeeze(-1)).T
-
-
-class SAC_VAR(OneFileAlgorithm):
+class SAC_VAR(OffPolicyAlgorithm):
     """Soft actor-critic with the variance of the critics as intrinsic reward.
 
     Args:
-        env: Vector environment with continuous actions.
-        learning_rate: Of actor, critics and temperature.
-        buffer_size: Transitions that the replay buffer holds.
-        learning_starts: Environment steps with random actions before the first update.
-        batch_size: Transitions per update.
-        tau: How far the target critics follow in each update.
-        gamma: Discount factor.
-        train_freq: Steps of each environment between rounds of updates.
-        gradient_steps: Updates per round; -1: as many as steps were collected.
         ent_coef: Weight alpha of the entropy: a number, ``auto`` (learned) or ``auto_0.1``
             (learned, from that initial value).
         target_entropy: Entropy that a learned alpha aims at; ``auto``: -n_actions.
@@ -171,27 +116,28 @@ class SAC_VAR(OneFileAlgorithm):
         log_act_step: The same for actions.
         net_arch: Sizes of the hidden layers of actor and critics.
         precision: ``float32`` or ``bfloat16``, of the matrix products.
-        replay_buffer_class: None: a plain replay buffer.
-        replay_buffer_kwargs: Further arguments of the replay buffer.
         intrinsic: A reward that the agent gives itself, mixed into the environment's; see
             `scilab_rl.algorithms.intrinsic`. None: none.
-        seed, device: See `OneFileAlgorithm`.
+        **common: Learning rate, batch size, gamma and so on, see `OffPolicyAlgorithm`.
     """
 
     supported_action_spaces = (spaces.Box,)
+    metrics = (
+        "train/critic_loss",
+        "train/actor_loss",
+        "train/ent_coef",
+        "train/intrinsic_reward",
+        "train/rollout_logpi_step",
+        ("train/ent_coef_loss", "ent_coef is auto", lambda self: self.learns_ent_coef),
+        # Over the target critics.
+        ("train/target_critic_variance", "n_critics is above 1", lambda self: self.n_critics > 1),
+        ("train/rollout_obs_step_*", "log_obs_step is true", lambda self: self.log_obs_step),
+        ("train/rollout_act_step_*", "log_act_step is true", lambda self: self.log_act_step),
+    )
 
     def __init__(
         self,
         *,
-        env: VecEnv,
-        learning_rate: float = 3e-4,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int = 1,
-        gradient_steps: int = 1,
         ent_coef: str | float = "auto",
         target_entropy: str | float = "auto",
         n_critics: int = 2,
@@ -202,20 +148,13 @@ class SAC_VAR(OneFileAlgorithm):
         log_act_step: bool = False,
         net_arch: Sequence[int] = (256, 256),
         precision: str = "float32",
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        intrinsic: str | Mapping[str, Any] | None = None,
-        seed: int | None = None,
-        device: str = "auto",
+        intrinsic: str | Mapping[str, object] | None = None,
+        **common: Any,
     ) -> None:
-        super().__init__(env=env, seed=seed, device=device)
-        self.learning_rate = learning_rate
-        self.learning_starts = learning_starts
-        self.batch_size = batch_size
-        self.tau = tau
-        self.gamma = gamma
-        self.train_freq = train_freq
-        self.gradient_steps = gradient_steps
+        if n_critics < 2 and weight_critic_var > 0:
+            raise ValueError("one critic has no variance: n_critics must be at least 2")
+        super().__init__(**common)
+        self.n_critics = n_critics
         self.weight_critic_var = weight_critic_var
         self.ignore_dones_for_qvalue = ignore_dones_for_qvalue
         self.action_scale_factor = action_scale_factor
@@ -227,7 +166,7 @@ class SAC_VAR(OneFileAlgorithm):
         self.actor = Actor(*sizes, action_scale_factor, autocast).to(self.device)
         self.critic = Critics(*sizes, n_critics, autocast).to(self.device)
         self.critic_target = copy.deepcopy(self.critic).requires_grad_(False)
-        adam = partial(torch.optim.Adam, lr=learning_rate, fused=True)
+        adam = partial(torch.optim.Adam, lr=self.learning_rate, fused=True)
         self.actor_optimizer = adam(self.actor.parameters())
         self.critic_optimizer = adam(self.critic.parameters())
 
@@ -240,41 +179,8 @@ class SAC_VAR(OneFileAlgorithm):
             self.log_ent_coef = self.ent_coef.log().requires_grad_(True)
             self.ent_coef_optimizer = adam([self.log_ent_coef])
 
-        self.replay_buffer = self.make_replay_buffer(
-            buffer_size, replay_buffer_class, replay_buffer_kwargs
-        )
+        self.make_replay_buffer()
         self.intrinsic = make_intrinsic_reward(intrinsic, self)
-
-    def iterate(self, callback: BaseCallback) -> bool:
-        """Collect ``train_freq`` steps of each environment, then update."""
-        if not self.collect(callback):
-            return False
-        if self.num_timesteps > self.learning_starts:
-            as_collected = self.train_freq * self.n_envs
-            self.train(self.gradient_steps if self.gradient_steps >= 0 else as_collected)
-        return True
-
-    def collect(self, callback: BaseCallback) -> bool:
-        """Act and store what happens; return False when the callback wants to stop."""
-        callback.on_rollout_start()
-        for _ in range(self.train_freq):
-            actions = self.explore()
-            env_actions = self.to_env_actions(actions)
-            self._record_step(self._last_obs, env_actions)
-            step = self.step(env_actions, callback)
-            if step is None:
-                return False
-            self.store(step, actions.cpu().numpy())
-        callback.on_rollout_end()
-        return True
-
-    def explore(self) -> Tensor:
-        """Choose the actions for the next step: random ones at first, then the policy's."""
-        if self.num_timesteps < self.learning_starts:
-            random_actions = self.from_env_actions(self.sample_env_actions())
-            return torch.as_tensor(random_actions) * self.action_scale_factor
-        with torch.no_grad():
-            return self.act(self.to_vector(self._last_obs), deterministic=False)
 
     def act(self, observations: Tensor, deterministic: bool) -> Tensor:
         """Choose actions in [-1, 1]."""
@@ -282,49 +188,52 @@ class SAC_VAR(OneFileAlgorithm):
             return self.actor.mean_action(observations)
         return self.actor.sample(observations)[0]
 
-    def train(self, gradient_steps: int) -> None:
+    def draw_random_actions(self) -> Tensor:
+        """Draw an action for each environment from the range that is used."""
+        return self.action_scale_factor * super().draw_random_actions()
+
+    def action_values(self, observations: Tensor, actions: Tensor) -> Tensor:
+        """Return what each critic thinks. Shapes: ``(batch, n_critics)``."""
+        return self.critic(observations, actions)
+
+    def update(self, batch: ReplayBufferSamples) -> dict[str, Tensor]:
         """Update temperature, critics, actor and target critics, in this order."""
-        losses: dict[str, list[Tensor]] = defaultdict(list)
-        for _ in range(gradient_steps):
-            batch = self.sample(self.batch_size)
-            if self.intrinsic is not None:
-                batch = self.intrinsic.add_to(batch)
-            actions, log_prob = self.actor.sample(batch.observations)
+        losses: dict[str, Tensor] = {}
+        actions, log_prob = self.actor.sample(batch.observations)
 
-            if self.learns_ent_coef:
-                self.ent_coef = self.log_ent_coef.detach().exp()
-                loss = temperature_loss(self.log_ent_coef, log_prob.detach(), self.target_entropy)
-                losses["ent_coef_loss"].append(descend(self.ent_coef_optimizer, loss))
+        if self.learns_ent_coef:
+            self.ent_coef = self.log_ent_coef.detach().exp()
+            loss = temperature_loss(self.log_ent_coef, log_prob.detach(), self.target_entropy)
+            losses["ent_coef_loss"] = gradient_step(self.ent_coef_optimizer, loss)
 
-            targets = self.compute_targets(batch)
-            loss = critic_loss(self.critic(batch.observations, batch.actions), targets)
-            losses["critic_loss"].append(descend(self.critic_optimizer, loss))
+        targets = self.compute_targets(batch)
+        loss = critic_loss(self.critic(batch.observations, batch.actions), targets)
+        losses["critic_loss"] = gradient_step(self.critic_optimizer, loss)
 
-            loss = actor_loss(log_prob, self.critic(batch.observations, actions), self.ent_coef)
-            losses["actor_loss"].append(descend(self.actor_optimizer, loss))
+        loss = actor_loss(log_prob, self.critic(batch.observations, actions), self.ent_coef)
+        losses["actor_loss"] = gradient_step(self.actor_optimizer, loss)
 
-            follow(self.critic_target, self.critic, self.tau)
-            self.n_updates += 1
-        self.record_losses(losses)
+        update_target(self.critic_target, self.critic, self.tau)
         self.logger.record("train/ent_coef", self.ent_coef)
+        return losses
 
     @torch.no_grad()
-    def compute_targets(self, batch: Any) -> Tensor:
+    def compute_targets(self, batch: ReplayBufferSamples) -> Tensor:
         """Return what the critics should say, y. Shapes: ``(batch, 1)``."""
         next_actions, next_log_prob = self.actor.sample(batch.next_observations)
         next_q = self.critic_target(batch.next_observations, next_actions)
         variance = critic_variance(next_q)
         intrinsic = min_max_scaled(variance)
         rewards = (1 - self.weight_critic_var) * batch.rewards + self.weight_critic_var * intrinsic
-        self.logger.record("train/critic_variance", variance.mean())
+        if self.n_critics > 1:
+            self.logger.record("train/target_critic_variance", variance.mean())
         self.logger.record("train/intrinsic_reward", intrinsic.mean())
         dones = torch.zeros_like(batch.dones) if self.ignore_dones_for_qvalue else batch.dones
         return soft_target(rewards, dones, next_q, next_log_prob, self.ent_coef, self.gamma)
 
-    def _record_step(self, observations: Observation, env_actions: np.ndarray) -> None:
+    def record_step(self, observations: Observation, env_actions: np.ndarray) -> None:
         """Record what the agent of the first environment sees, does and thinks of it."""
-        q = LazyNumber(lambda: self.q_values(observations, env_actions)[0].min())
-        self.logger.record("train/rollout_q_step", q)
+        super().record_step(observations, env_actions)
         logpi = LazyNumber(lambda: self.log_prob(observations, env_actions)[0])
         self.logger.record("train/rollout_logpi_step", logpi)
         if self.log_obs_step:
@@ -333,15 +242,9 @@ class SAC_VAR(OneFileAlgorithm):
             self.record_dimensions("train/rollout_act_step", env_actions[0])
 
     @torch.no_grad()
-    def q_values(self, observations: Observation, env_actions: np.ndarray) -> Tensor:
-        """Return what each critic thinks of a batch of steps. Shapes: ``(batch, n_critics)``."""
-        actions = torch.as_tensor(self.from_env_actions(env_actions), device=self.device)
-        return self.critic(self.to_vector(observations), actions)
-
-    @torch.no_grad()
     def log_prob(self, observations: Observation, env_actions: np.ndarray) -> Tensor:
         """Return the log density of actions scaled to [-1, 1]. Shapes: ``(batch,)``."""
-        actions = torch.as_tensor(self.from_env_actions(env_actions), device=self.device)
+        actions = self.to_actions(env_actions)
         return self.actor.log_prob(self.to_vector(observations), actions).squeeze(1)
 
 
@@ -403,15 +306,6 @@ def actor_loss(log_prob: Tensor, q_values: Tensor, ent_coef: Tensor | float) -> 
     return (ent_coef * log_prob - q_values.amin(dim=1, keepdim=True)).mean()
 
 
-def critic_variance(q_values: Tensor) -> Tensor:
-    """Return how much the critics disagree: the mean squared deviation from their mean.
-
-    Shapes:
-        q_values: ``(batch, n_critics)``; result: ``(batch, 1)``.
-    """
-    return q_values.var(dim=1, correction=0, keepdim=True)
-
-
 def min_max_scaled(values: Tensor) -> Tensor:
     """Scale a batch to [0, 1]; equal values become 0.
 
@@ -420,33 +314,6 @@ def min_max_scaled(values: Tensor) -> Tensor:
     """
     span = values.max() - values.min()
     return (values - values.min()) / span.clamp(min=torch.finfo(values.dtype).tiny)
-
-
-def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> Tensor:
-    """Take one step down the gradient, of the optimizer's own parameters only; return the loss."""
-    optimizer.zero_grad()
-    loss.backward(inputs=[p for group in optimizer.param_groups for p in group["params"]])
-    optimizer.step()
-    return loss.detach()
-
-
-@torch.no_grad()
-def follow(target: nn.Module, source: nn.Module, tau: float) -> None:
-    """Move the target network a fraction tau towards the learned one."""
-    for slow, fast in zip(target.parameters(), source.parameters(), strict=True):
-        slow.lerp_(fast, tau)
-
-
-def autocast_to(precision: str, device: torch.device) -> Autocast:
-    """Return what opens a context whose matrix products have this precision.
-
-    Weights, gradients of weights, losses and everything outside of the context stay float32.
-    """
-    if precision == "float32":
-        return nullcontext
-    if precision != "bfloat16":
-        raise ValueError(f"precision must be float32 or bfloat16, but it is {precision!r}")
-    return partial(torch.autocast, device.type, torch.bfloat16)
 
 
 def parse_ent_coef(ent_coef: str | float) -> tuple[bool, float]:

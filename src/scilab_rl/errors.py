@@ -30,7 +30,7 @@ class MissingDependencyError(ConfigError):
         package: The package that failed to import.
         extra: The extra of Scilab-RL that installs it.
         purpose: What it is needed for, as in "to track runs with MLflow".
-        pip_options: What pip has to be told, with a space at its end.
+        pip_options: Options of pip, with a space at the end.
     """
 
     def __init__(self, package: str, extra: str, purpose: str, pip_options: str = "") -> None:
@@ -48,7 +48,7 @@ class NumericalError(AlgorithmError):
     """A NaN or an infinity appeared where a number has to be."""
 
 
-class EnvironmentError_(ScilabRLError):
+class EnvironmentFailure(ScilabRLError):
     """An environment failed or broke its contract."""
 
 
@@ -85,7 +85,7 @@ def did_you_mean(given: str, allowed: Iterable[str]) -> str:
 
 
 def nearest_word(given: str, allowed: Iterable[str]) -> str | None:
-    """Return the allowed word that is most like the given one, or None when none is near."""
+    """Return the allowed word that is most like the given one, or None if none is near."""
     plain = {word: word.lower().replace("-", "").replace("_", "") for word in allowed}
     target = given.lower().replace("-", "").replace("_", "")
 
@@ -94,6 +94,15 @@ def nearest_word(given: str, allowed: Iterable[str]) -> str | None:
 
     best = max(plain, key=likeness, default=None)
     return best if best is not None and likeness(best) >= 0.6 else None
+
+
+def first_line(error: BaseException) -> str:
+    r"""Return the first line of an error's message, or its type when it has none.
+
+    >>> first_line(ValueError("No space left.\nDetails follow.")), first_line(KeyboardInterrupt())
+    ('No space left.', 'KeyboardInterrupt')
+    """
+    return str(error).strip().partition("\n")[0] or type(error).__name__
 
 
 def listing(words: Iterable[str], limit: int = 12) -> str:

@@ -17,10 +17,11 @@ from typing import IO, Any
 # Tests set it to let a process end, or a disk fill up, at a place of their choice.
 FAULT_VARIABLE = "SCILAB_FAULT"
 _TEMPORARY = ".*.tmp"
+_POLL_SECONDS = 0.005  # while a lock is waited for
 _passed: Counter[str] = Counter()
 
 
-def crash_point(name: str) -> None:
+def fault_point(name: str) -> None:
     """Do what ``SCILAB_FAULT`` asks for at this place; without it, nothing.
 
     ``checkpoint.after_tensors:3:SIGKILL`` ends the process when it passes here for the third time,
@@ -46,8 +47,26 @@ def crash_point(name: str) -> None:
         raise OSError(number, os.strerror(number))
 
 
+def lock(file: IO[Any], *, wait: bool = True) -> bool:
+    """Lock an open file until it is closed; the kernel drops the lock when the process dies.
+
+    Args:
+        file: An open file, for reading or writing.
+        wait: Whether to wait for another process that holds the lock.
+
+    Returns:
+        Whether the lock is ours.
+
+    Raises:
+        OSError: If the drive has no locks.
+    """
+    from filelock import lock_descriptor  # 60 ms, which most commands can do without
+
+    return lock_descriptor(file.fileno(), blocking=wait, poll_interval=_POLL_SECONDS)
+
+
 def remove_unfinished(directory: Path) -> None:
-    """Remove what a killed process was writing in this directory; nobody else may write there."""
+    """Remove what a killed process was writing in this directory, which must be unused."""
     for abandoned in directory.glob(_TEMPORARY):
         if abandoned.is_dir() and not abandoned.is_symlink():
             shutil.rmtree(abandoned, ignore_errors=True)
@@ -56,7 +75,7 @@ def remove_unfinished(directory: Path) -> None:
 
 
 def discard(directory: Path) -> None:
-    """Remove a directory that nobody else uses.
+    """Remove a directory that no other process uses.
 
     It is renamed first, so that one that is half removed cannot be taken for a whole one; what a
     process leaves that is killed meanwhile, `remove_unfinished` removes.
@@ -64,7 +83,7 @@ def discard(directory: Path) -> None:
     doomed = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
     with contextlib.suppress(OSError):
         directory.rename(doomed)
-        crash_point("files.in_discarding")
+        fault_point("files.in_discarding")
     shutil.rmtree(doomed, ignore_errors=True)
 
 
@@ -81,7 +100,7 @@ def atomic_write(path: Path, write: Callable[[IO[bytes]], object]) -> None:
             write(file)
             file.flush()
             os.fsync(file.fileno())
-        crash_point("file.before_replace")
+        fault_point("file.before_replace")
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
@@ -96,6 +115,19 @@ def write_text(path: Path, text: str) -> None:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file atomically, with keys in their given order."""
     write_text(path, json.dumps(value, indent=2) + "\n")
+
+
+def read_json_lines(path: Path) -> list[dict[str, Any]]:
+    """Return the objects of a JSONL file; none when it does not exist.
+
+    A line that cannot be parsed is skipped: a killed run may have written half of the last one.
+    """
+    rows = []
+    if path.is_file():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            with contextlib.suppress(ValueError):
+                rows.append(json.loads(line))
+    return [row for row in rows if isinstance(row, dict)]
 
 
 def fsync_directory(directory: Path) -> None:

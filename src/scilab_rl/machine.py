@@ -1,4 +1,4 @@
-"""What the computer offers to this process."""
+"""The resources of the computer that this process may use."""
 
 from __future__ import annotations
 

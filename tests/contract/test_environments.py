@@ -1,4 +1,4 @@
-"""Every environment that Scilab-RL brings takes the exam, and moves as it did when released."""
+"""Every environment of Scilab-RL passes the contract test and moves as before."""
 
 from __future__ import annotations
 

@@ -12,7 +12,7 @@ import pytest
 from .pages import ROOT
 
 SOURCE = ROOT / "src" / "scilab_rl"
-NEEDS = {"jax_engine": "jax", "jaxsac": "jax", "jaxtd3": "jax"}
+NEEDS = {"jax_engine": "jax", "jax_off_policy": "jax", "jaxsac": "jax", "jaxtd3": "jax"}
 
 
 def modules_with_examples() -> list[Path]:
@@ -30,8 +30,9 @@ def test_examples(path: Path) -> None:
     assert result.failed == 0
 
 
-def test_examples_of_the_generator() -> None:
-    spec = importlib.util.spec_from_file_location("generate", ROOT / "docs" / "generate.py")
+@pytest.mark.parametrize("name", ["docs/generate.py", "scripts/measure_code.py"])
+def test_examples_of_scripts(name: str) -> None:
+    spec = importlib.util.spec_from_file_location("script", ROOT / name)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)

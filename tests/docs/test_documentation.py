@@ -17,7 +17,7 @@ import gymnasium
 import pytest
 import yaml
 
-from scilab_rl.cli import COMMANDS, run_command_line
+from scilab_rl.cli.main import COMMANDS, run_command_line
 
 from ..e2e.commands import quiet_environment
 from .pages import DOCS, ROOT, Block, blocks_of, insert_after, pages
@@ -27,6 +27,7 @@ SHORT = {
     "eval_after_n_steps": "60",
     "n_test_rollouts": "1",
     "mlflow": "0",
+    "require_updates": "false",
 }
 # Whatever else an algorithm has that could take long.
 SMALL_ALGORITHM = {
@@ -36,8 +37,8 @@ SMALL_ALGORITHM = {
     "algorithm.net_arch": "[16,16]",
 }
 STUDY = {"hydra.sweeper.max_trials": "4", "hydra.sweeper.n_jobs": "2"}
-# The desk's own modules: those of one page must not be found by the next.
-DESK_MODULES = ("custom_algorithms", "custom_envs", "custom_probes")
+# The project folder's own modules: those of one page must not be found by the next.
+PROJECT_MODULES = ("custom_algorithms", "custom_envs", "custom_probes")
 EXECUTED = ("bash", "python", "yaml")
 STORY = DOCS / "story.md"  # has a test of its own
 
@@ -52,8 +53,8 @@ def executable_pages() -> list[Path]:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder with a fresh copy of the repository's desk."""
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A folder with a fresh copy of the repository's project."""
     listed = subprocess.run(
         ["git", "-c", "safe.directory=*", "ls-files", "conf", "src/custom_*", "src/main.py"],
         cwd=ROOT, capture_output=True, text=True, check=True,
@@ -69,25 +70,25 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def forget_desk() -> None:
-    """Let the next import of the desk read its files."""
+    """Let the next import of the project folder read its files."""
     for name in list(sys.modules):
-        if name.partition(".")[0] in DESK_MODULES:
+        if name.partition(".")[0] in PROJECT_MODULES:
             del sys.modules[name]
     for env_id, spec in list(gymnasium.registry.items()):
-        if str(spec.entry_point).startswith(DESK_MODULES):
+        if str(spec.entry_point).startswith(PROJECT_MODULES):
             del gymnasium.registry[env_id]
 
 
 @pytest.mark.parametrize(
     "page", executable_pages(), ids=lambda p: p.relative_to(DOCS).with_suffix("").as_posix()
 )
-def test_page(page: Path, desk: Path) -> None:
+def test_page(page: Path, project: Path) -> None:
     for block in blocks_of(page):
         if block.language in EXECUTED:
             execute(block, f"{page.relative_to(ROOT)}:{block.line}")
 
 
-def test_commands_of_the_readme(desk: Path) -> None:
+def test_commands_of_the_readme(project: Path) -> None:
     """What installs, opens a window or continues an interrupted run is tested elsewhere."""
     elsewhere = ("make", "source", "scilab-rl view", "scilab-rl resume")
     readme = ROOT / "README.md"
@@ -124,7 +125,7 @@ def test_pages_name_only_commands_and_keys_that_exist() -> None:
             assert command in COMMANDS, f"{page.name}: scilab-rl {command}"
 
 
-def test_columns_of_a_run_are_explained(desk: Path) -> None:
+def test_columns_of_a_run_are_explained(project: Path) -> None:
     words = "algorithm=cleansac env=scilab_rl.testing:TinyReach-v0"
     type_command(f"python src/main.py {words}", {}, "here")
     columns = (Path("data/last/metrics.csv").read_text().splitlines()[0]).split(",")
@@ -212,6 +213,6 @@ def parameters_of(algorithm: str) -> set[str]:
 
 
 def is_study(arguments: list[str]) -> bool:
-    """Tell whether a multirun searches."""
+    """Return whether a multirun searches."""
     searching = ("choice(", "interval(", "+search", "+performance")
     return any(word in argument for argument in arguments for word in searching)

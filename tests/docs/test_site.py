@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from scilab_rl.cli import COMMANDS
-from scilab_rl.config import KEYS
+from scilab_rl.cli.main import COMMANDS
+from scilab_rl.config.schema import KEYS
+from scilab_rl.config.workspace import config_files
 from scilab_rl.metrics.probes import PROBE_NAMES
-from scilab_rl.workspace import config_files
 
 from ..e2e.commands import quiet_environment
 from .pages import ROOT, pages
@@ -63,6 +63,14 @@ def test_reference_is_complete(site: Path) -> None:
     assert [name for name in shipped if f'id="{name}"' not in algorithms] == []
     api = text_of(site / "reference" / "api.html")
     assert "OneFileAlgorithm" in api and "sample_goal" in api
+
+
+def test_environments_show_what_has_been_learned(site: Path) -> None:
+    page = text_of(site / "environments.html")
+    baselines = (ROOT / "baselines").glob("*/*.json")
+    names = [f"{path.parent.name}/{path.stem}" for path in baselines]
+    assert names and [name for name in names if f"<code>{name}</code>" not in page] == []
+    assert "<td>fail</td>" in page
 
 
 def test_external_links_are_well_formed_and_few_hosts() -> None:

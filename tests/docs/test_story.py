@@ -24,7 +24,7 @@ MOST_COMMANDS, MOST_EDITS, MOST_SECONDS = 7, 1, 30 * 60
 FULL = os.environ.get("STORY") == "full"
 # What makes each training short, by a word of its command.
 SHORT = {
-    "make demo": "DEMO='n_epochs=1 eval_after_n_steps=200 n_test_rollouts=1'",
+    "make demo": "DEMO='n_epochs=1 eval_after_n_steps=200 n_test_rollouts=1 require_updates=false'",
     "seeds=5": "seeds=3 n_epochs=1 eval_after_n_steps=200 n_test_rollouts=2",
     "choice(": "n_epochs=1 eval_after_n_steps=200 n_test_rollouts=2 hydra.sweeper.max_trials=6",
 }
@@ -44,7 +44,7 @@ sys.exit(view.wait(30) not in (0, 130))
 
 
 def has_private_network() -> bool:
-    """Tell whether this machine lets us cut the network off."""
+    """Return whether this machine lets us cut the network off."""
     command = ["unshare", "-rn", "ip", "link", "set", "lo", "up"]
     if not (shutil.which("unshare") and shutil.which("ip")):
         return False
@@ -73,8 +73,8 @@ def test_count_of_commands_and_edits() -> None:
 
 
 def test_story(tmp_path: Path) -> None:
-    desk = clone(tmp_path)
-    install(desk)
+    project = clone(tmp_path)
+    install(project)
     started = time.monotonic()
     printed: list[str] = []
     seconds: dict[str, float] = {}
@@ -82,58 +82,60 @@ def test_story(tmp_path: Path) -> None:
     for block in story():
         began = time.monotonic()
         if block.language != "bash":
-            path = desk / str(block.title)
+            path = project / str(block.title)
             line = str(block.story).removeprefix("edit after ")
             path.write_text(insert_after(path.read_text(), line, block.text))
             continue
         (command,) = block.commands
         activated = activated or command.startswith("source ")
-        printed.append(type_command(command, desk, activated))
+        printed.append(type_command(command, project, activated))
         seconds[command.split(" env=")[0]] = round(time.monotonic() - began, 1)
     total = time.monotonic() - started
     sys.stderr.write(f"{len(seconds)} commands, {total:.0f} s: {json.dumps(seconds, indent=1)}\n")
     assert total < MOST_SECONDS
     assert "95 % interval" in printed[0]
-    assert list((desk / "data").glob("*/*FetchReach*/episodes/play_001.mp4"))
-    assert len(list((desk / "data").glob("*/*Reach1DOF*my_sac*"))) >= 3
+    assert list((project / "data").glob("*/*FetchReach*/episodes/play_001.mp4"))
+    assert len(list((project / "data").glob("*/*Reach1DOF*my_sac*"))) >= 3
     assert "my_study" in printed[-1] and "cleansac" in printed[-1]
 
 
 def clone(folder: Path) -> Path:
     """Copy the tracked files of the repository as they are now."""
-    desk = folder / "scilab-rl"
+    project = folder / "scilab-rl"
     listed = subprocess.run(
         ["git", "-c", "safe.directory=*", "ls-files", "-z"],
         cwd=ROOT, capture_output=True, text=True, check=True,
     )  # fmt: skip
     for name in filter(None, listed.stdout.split("\0")):
-        (desk / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(ROOT / name, desk / name)
-    return desk
+        (project / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, project / name)
+    return project
 
 
-def install(desk: Path) -> None:
+def install(project: Path) -> None:
     """Do what ``make setup`` does, with the packages of the running environment."""
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(desk / ".venv")], check=True)
-    (site,) = (desk / ".venv").glob("lib/python*/site-packages")
+    subprocess.run(
+        [sys.executable, "-m", "venv", "--without-pip", str(project / ".venv")], check=True
+    )
+    (site,) = (project / ".venv").glob("lib/python*/site-packages")
     (site / "outer.pth").write_text(f"{sysconfig.get_path('purelib')}\n")
-    pip = [sys.executable, "-m", "pip", "--python", str(desk / ".venv" / "bin" / "python")]
+    pip = [sys.executable, "-m", "pip", "--python", str(project / ".venv" / "bin" / "python")]
     offline = ["--no-deps", "--no-index", "--no-build-isolation", "--quiet"]
-    subprocess.run([*pip, "install", *offline, "-e", str(desk)], check=True, cwd=desk)
-    (desk / ".venv" / ".installed").touch()
+    subprocess.run([*pip, "install", *offline, "-e", str(project)], check=True, cwd=project)
+    (project / ".venv" / ".installed").touch()
 
 
-def type_command(command: str, desk: Path, activated: bool) -> str:
+def type_command(command: str, project: Path, activated: bool) -> str:
     """Type a line into a shell without network and return what it printed."""
     if not FULL:
         command = " ".join([command, *(more for word, more in SHORT.items() if word in command)])
     if "scilab-rl view" in command:
-        (desk / "look.py").write_text(LOOK)
+        (project / "look.py").write_text(LOOK)
         command = f"python look.py {command}"
     prefix = "source .venv/bin/activate && " if activated else ""
     done = subprocess.run(
         [*OFFLINE, "bash", "-c", prefix + command],
-        cwd=desk, env=quiet_environment(DISPLAY=""), capture_output=True, text=True,
+        cwd=project, env=quiet_environment(DISPLAY=""), capture_output=True, text=True,
         timeout=MOST_SECONDS, check=False,
     )  # fmt: skip
     assert done.returncode == 0, f"{command}\n{done.stdout[-3000:]}\n{done.stderr[-3000:]}"

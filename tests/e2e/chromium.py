@@ -27,7 +27,7 @@ class Chromium:
 
     Args:
         size: Width and height of the window in pixels.
-        dark: Whether pages are told that the user prefers dark colours.
+        dark: Whether pages are told that the user prefers dark colors.
     """
 
     def __init__(self, size: tuple[int, int] = (1400, 820), *, dark: bool = False) -> None:

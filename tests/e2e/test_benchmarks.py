@@ -48,9 +48,17 @@ SMALLEST = {
         ["scaling.py", "--rounds", "1", "--steps", "2", "--sizes", "32,16", "--n-envs", "1", "2"],
         "updates",
     ),
+    "gpu": (
+        [
+            "gpu.py", "--rounds", "1", "--steps", "120", "--sizes", "16,16",
+            "--only", "jaxsac", "cleansac",
+        ],
+        "rows",
+    ),
     "cost": (["cost.py", "--rounds", "1", "--steps", "60", *SMALL_RUN], "declared metrics"),
     "showing": (["-c", SMALLER_SHOWING], "stuck_viewer"),
     "study": (["smaller_study.py"], "unequal"),
+    "decisions": (["decisions.py", "--runs", "30"], "sqlite, 30 runs"),
     "metrics": (["load.py", "metrics", "--scale", "0.01"], "part"),
     "reach": (
         [
@@ -75,7 +83,7 @@ def benchmarks(monkeypatch: pytest.MonkeyPatch) -> Any:
 def test_runs_in_its_smallest_size(name: str, tmp_path: Path, benchmarks: Any) -> None:
     if name == "showing":
         pytest.importorskip("rerun")
-    if name in ("startup", "updates", "steps", "scaling", "cost"):
+    if name in ("startup", "updates", "steps", "scaling", "gpu", "cost"):
         pytest.importorskip("jax")
     if name == "cost":
         pytest.importorskip("mlflow")
@@ -107,8 +115,8 @@ def test_runs_in_its_smallest_size(name: str, tmp_path: Path, benchmarks: Any) -
 def test_each_script_has_a_name_and_each_name_a_smallest_size(benchmarks: Any) -> None:
     named = {benchmark.words[0] for benchmark in benchmarks("all").BENCHMARKS.values()}
     scripts = {path.name for path in BENCHMARKS.glob("*.py")}
-    # `gates.py` simulates statistics and draws a figure; it measures nothing.
-    assert named == scripts - {"all.py", "turns.py", "participants.py", "gates.py"}
+    # `acceptance_rules.py` simulates statistics and draws a figure; it measures nothing.
+    assert named == scripts - {"all.py", "turns.py", "participants.py", "acceptance_rules.py"}
     run_here = {benchmarks("all").BENCHMARKS[name].words[0] for name in SMALLEST}
     assert run_here == named
 
@@ -135,6 +143,18 @@ def test_rows_are_compared_with_peers_and_with_the_limit(benchmarks: Any) -> Non
     assert (ours["ratio"], ours["sbx_ratio"], ours["cpu_ratio"]) == (4, 2, 4)
     assert ours["of_limit"] == 0.8
     assert results[updates.PRODUCTS]["gflops"] == 125  # 0.5 GFLOP in 4 ms
+
+
+def test_a_gpu_is_compared_with_the_cpu_in_the_same_turns(benchmarks: Any) -> None:
+    gpu, turns = benchmarks("gpu"), benchmarks("turns")
+    times = {
+        device: [turns.Seconds(wall, 0.0) for wall in walls]
+        for device, walls in {"cpu": (4.0, 8.0, 6.0), "cuda": (1.0, 4.0, 2.0)}.items()
+    }
+    row = gpu.compare(times, n_steps=120)
+    assert (row["cpu"], row["cuda"], row["times"]) == (20.0, 60.0, 3.0)  # of 4, 2 and 3
+    assert set(gpu.compare({"cpu": times["cpu"]}, n_steps=120)) == {"cpu"}
+    assert "3.00" in gpu.table({"jaxsac 256,256,256": row})
 
 
 def test_turns_go_forwards_and_backwards(benchmarks: Any) -> None:

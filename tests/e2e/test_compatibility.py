@@ -11,7 +11,7 @@ import pytest
 from .commands import ROOT, config_of, last_run, scilab_rl
 
 SHORT = (
-    "n_epochs=1", "eval_after_n_steps=60", "n_test_rollouts=1", "mlflow=0",
+    "n_epochs=1", "eval_after_n_steps=60", "n_test_rollouts=1", "mlflow=0", "require_updates=false",
     "++algorithm.buffer_size=1000", "++algorithm.batch_size=16", "tuned=false",
 )  # fmt: skip
 
@@ -47,8 +47,8 @@ COMMANDS = [
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Path:
-    """A folder with the desk of the repository, so that runs land elsewhere."""
+def project(tmp_path: Path) -> Path:
+    """A folder with the project folder of the repository, so that runs land elsewhere."""
     (tmp_path / "conf").symlink_to(ROOT / "conf")
     (tmp_path / "src").symlink_to(ROOT / "src")
     return tmp_path
@@ -56,25 +56,25 @@ def desk(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("line", "env"), COMMANDS, ids=[line for line, _ in COMMANDS])
-def test_command_runs_word_for_word(line: str, env: str, desk: Path) -> None:
+def test_command_runs_word_for_word(line: str, env: str, project: Path) -> None:
     arguments = shlex.split(line)[2:]
     given = {argument.lstrip("+").partition("=")[0] for argument in arguments}
     short = [key for key in SHORT if key.lstrip("+").partition("=")[0] not in given]
     if "algorithm=ppo" in arguments:
         short = [key for key in short if "buffer_size" not in key] + ["++algorithm.n_steps=32"]
-    done = scilab_rl(*arguments, *short, cwd=desk)
+    done = scilab_rl(*arguments, *short, cwd=project)
     assert done.returncode == 0, done.stderr
-    run = last_run(desk)
+    run = last_run(project)
     assert config_of(run)["env"] == env
     assert json.loads((run / "result.json").read_text())["epochs"] >= 1
 
 
 @pytest.mark.slow
-def test_sweep_over_algorithms_goes_on_after_a_failure(desk: Path) -> None:
+def test_sweep_over_algorithms_goes_on_after_a_failure(project: Path) -> None:
     done = scilab_rl(
-        "--multirun", "algorithm=sac,dqn,td3", "env=Pendulum-v1", *SHORT, cwd=desk, timeout=300
+        "--multirun", "algorithm=sac,dqn,td3", "env=Pendulum-v1", *SHORT, cwd=project, timeout=300
     )
     assert done.returncode == 3  # the sweep has finished, and some runs failed
     assert "dqn needs Discrete actions" in done.stderr
-    results = list(desk.glob("data/*/*/result.json"))
+    results = list(project.glob("data/*/*/result.json"))
     assert len(results) == 2

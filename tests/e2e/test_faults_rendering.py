@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from scilab_rl.visualization.archive import load_clip
+from scilab_rl.recording.records import load_clip
 
 from .commands import QUICK, command, last_run, quiet_environment, scilab_rl
 
@@ -25,26 +25,25 @@ RECORD = ("algorithm=random", "render=record", "render_freq=1", "mlflow=0", "n_t
 WITH_SMALL_DISK = """
 import shutil, subprocess, sys
 from pathlib import Path
-import hydra
-from scilab_rl import config, experiment
-from scilab_rl.workspace import open_desk
+from scilab_rl.config.compose import compose
+from scilab_rl.config.workspace import open_project
+from scilab_rl.run.run import start_run
+from scilab_rl.training.callbacks import RunCallback
 
 kept = Path("kept")
 
-def mount(session):
-    folder = session.directory / "episodes"
-    folder.mkdir()
-    disk = ["-t", "tmpfs", "-o", f"size={sys.argv[1]}", "tmpfs", str(folder)]
-    subprocess.run(["mount", *disk], check=True)
-    close = session.showing.close
-    def close_and_keep():
-        close()
-        shutil.copytree(folder, kept)
-    session.showing.close = close_and_keep
+class SmallDisk(RunCallback):
+    def begin(self, trainer):
+        self.folder = trainer.run_dir / "episodes"
+        self.folder.mkdir()
+        disk = ["-t", "tmpfs", "-o", f"size={sys.argv[1]}", "tmpfs", str(self.folder)]
+        subprocess.run(["mount", *disk], check=True)
 
-open_desk()
-with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-    result = experiment.run(config.compose(sys.argv[2:]), watch=mount)
+    def close(self):
+        shutil.copytree(self.folder, kept)
+
+open_project()
+result = start_run(compose(sys.argv[2:]), callbacks=[SmallDisk()])
 print(result.status, result.steps)
 """
 
@@ -52,8 +51,8 @@ print(result.status, result.steps)
 WITH_STUCK_VIEWER = """
 import os, signal, subprocess, time
 import numpy as np
-from scilab_rl.visualization.live import LiveViewer, free_port, start_viewer
-from scilab_rl.visualization.records import ClipInfo, Record, encode_picture
+from scilab_rl.recording.live import LiveViewer, free_port, start_viewer
+from scilab_rl.recording.records import ClipInfo, Record, encode_picture
 
 viewer = LiveViewer((), window=False)
 options = ["--serve-grpc", "--bind", "127.0.0.1", "--port", str(free_port(viewer.data_port + 1))]
@@ -100,7 +99,7 @@ def test_f05_full_disk_ends_recording_not_training(tmp_path: Path, size: str) ->
     log = (last_run(tmp_path) / "train.log").read_text(encoding="utf-8")
     warnings = [line for line in log.splitlines() if "WARNING" in line]
     assert len(warnings) == 1, log
-    assert "Training goes on" in warnings[0]
+    assert "Training continues" in warnings[0]
     for path in (tmp_path / "kept").iterdir():
         check_whole(path)
 
@@ -221,7 +220,7 @@ def test_own_window_of_the_environment(display: str, tmp_path: Path) -> None:
         stderr=subprocess.DEVNULL,
     ) as run:
         while run.poll() is None:
-            seen = max(seen, n_colours(display))
+            seen = max(seen, n_colors(display))
             time.sleep(0.2)
     assert run.returncode == 0
     assert seen > 100  # an empty screen has one
@@ -253,7 +252,7 @@ def test_f33_window_listens_to_this_machine_only(display: str) -> None:
     pytest.importorskip("rerun")
     script = """
 import psutil, time
-from scilab_rl.visualization.live import LiveViewer
+from scilab_rl.recording.live import LiveViewer
 viewer = LiveViewer((), window=True)
 (window,) = psutil.Process().children()
 addresses = set()
@@ -290,11 +289,11 @@ def test_f34_stuck_viewer_delays_neither_training_nor_its_end() -> None:
     assert n_dropped >= 500
     assert longest < 0.1
     assert ended - float(closed) < 6.0  # the viewer's package alone would wait for eleven seconds
-    assert done.stderr.count("does not keep up") == 1
+    assert done.stderr.count("is too slow") == 1
 
 
-def n_colours(display: str) -> int:
-    """Return how many colours there are on a display, looking at every eighth row."""
+def n_colors(display: str) -> int:
+    """Return how many colors there are on a display, looking at every eighth row."""
     from PIL import ImageGrab
 
     with ImageGrab.grab(xdisplay=display) as image:
@@ -345,7 +344,7 @@ def test_f26_encoder_that_is_killed_costs_one_video(tmp_path: Path) -> None:
     done = scilab_rl(*options, cwd=tmp_path, IMAGEIO_FFMPEG_EXE=str(encoder))
     assert done.returncode == 0, done.stderr
     assert has_killed.exists()
-    said = ".mp4 could not be written: ffmpeg ended before the video did. Training goes on"
+    said = ".mp4 could not be written: ffmpeg ended before the video did. Training continues"
     assert done.stderr.count(said) == done.stderr.count("could not be written") == 1
     run = last_run(tmp_path)
     assert json.loads((run / "result.json").read_text())["status"] == "finished"
@@ -354,3 +353,66 @@ def test_f26_encoder_that_is_killed_costs_one_video(tmp_path: Path) -> None:
         check_whole(path)
     counts = {suffix: sum(p.suffix == suffix for p in kept) for suffix in (".npz", ".html", ".mp4")}
     assert counts == {".npz": 4, ".html": 4, ".mp4": 3}
+
+
+DRAWINGS = """
+import gymnasium, numpy as np
+
+class Drawn(gymnasium.Env):
+    metadata = {"render_modes": ["rgb_array"]}
+    observation_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, render_mode=None, kind="picture"):
+        self.render_mode, self.kind = render_mode, kind
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        self.t += 1
+        return np.zeros(2, np.float32), float(self.t), False, False, {}
+
+    def render(self):
+        if self.kind == "picture":  # transparent floats whose size is odd and grows
+            return np.full((31 + self.t, 41, 4), 0.5)
+        return None if self.kind == "nothing" else 1 / 0
+
+gymnasium.register("Drawn-v0", entry_point=Drawn, max_episode_steps=10)
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "vector"),
+    [("picture", "inprocess"), ("nothing", "subprocess"), ("error", "inprocess")],
+)
+def test_whatever_render_returns_the_curves_are_recorded(
+    tmp_path: Path, kind: str, vector: str
+) -> None:
+    (tmp_path / "drawings.py").write_text(DRAWINGS, encoding="utf-8")
+    done = scilab_rl(
+        "env=drawings:Drawn-v0",
+        f"env_kwargs.kind={kind}",
+        "n_envs=2",
+        f"vector={vector}",
+        *RECORD,
+        "n_epochs=2",
+        "eval_after_n_steps=40",
+        "render_metrics_train=[reward]",
+        "render_metrics_test=[reward]",
+        cwd=tmp_path,
+        PYTHONPATH=os.pathsep.join([str(tmp_path), os.environ.get("PYTHONPATH", "")]),
+    )
+    assert done.returncode == 0, done.stderr
+    said = (done.stdout + done.stderr).count("Scenes without picture")
+    assert said == (0 if kind == "picture" else 1)
+    clips = sorted((last_run(tmp_path) / "episodes").glob("*.npz"))
+    assert len(clips) >= 3
+    for path in clips:
+        check_whole(path.with_suffix(".mp4"))
+        check_whole(path.with_suffix(".html"))
+        clip = load_clip(path)
+        assert clip.curves("reward")[""] == [*map(float, range(1, 11)), None]
+        assert all(bool(record.picture) == (kind == "picture") for record in clip.records)

@@ -19,7 +19,7 @@ from .commands import ROOT, TINY, command, config_of, quiet_environment, scilab_
 
 TINY_RUNS = (
     "algorithm=sac", TINY, "n_epochs=2", "eval_after_n_steps=50", "n_test_rollouts=2", "mlflow=0",
-    "algorithm.buffer_size=1000", "algorithm.learning_starts=1000",
+    "algorithm.buffer_size=1000", "algorithm.learning_starts=1000", "require_updates=false",
 )  # fmt: skip
 GAMMA = "algorithm.gamma=interval(0.9,0.99)"
 
@@ -29,15 +29,15 @@ def study_of(folder: Path, name: str) -> Path:
 
 
 def runs_of(study: Path) -> list:
-    from scilab_rl.hyperopt.ledger import open_ledger
+    from scilab_rl.search.storage import open_study
 
-    return open_ledger(study).runs()
+    return open_study(study).runs()
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A small study, shared by the tests that only look at it."""
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("project")
     done = scilab_rl(
         *TINY_RUNS, GAMMA, "--multirun", "hydra.sweeper.max_trials=4",
         "hydra.sweeper.min_trials_per_param=2", "hydra.sweeper.study_name=mine", cwd=folder,
@@ -52,9 +52,7 @@ def test_leaves_a_whole_report(finished: Path) -> None:
     page = (study / "report.html").read_text()
     assert "data:image/png;base64," in page
     assert "http" not in page
-    assert (
-        (study / "settings.csv").read_text().splitlines()[0].startswith("setting,algorithm.gamma")
-    )
+    assert (study / "configurations.csv").read_text().startswith("configuration,algorithm.gamma")
     runs = runs_of(study)
     assert [run.state for run in runs] == ["complete"] * 6
     first = config_of(finished / runs[0].run_dir)
@@ -85,7 +83,7 @@ def test_f20_another_search_space_is_refused(finished: Path) -> None:
 
 def test_trains_with_the_winner(finished: Path) -> None:
     winner = json.loads((study_of(finished, "mine") / "winner.json").read_text())["overrides"][-1]
-    done = scilab_rl("+best_of=mine", "seed=3", "n_epochs=1", cwd=finished)
+    done = scilab_rl("+from_study=mine", "seed=3", "n_epochs=1", cwd=finished)
     assert done.returncode == 0, done.stderr
     config = config_of((finished / "data" / "last").resolve())
     assert winner == f"++algorithm.gamma={config['algorithm']['gamma']}"
@@ -163,7 +161,7 @@ def test_study_command_shows_and_keeps_the_winner(finished: Path) -> None:
     shown = scilab_rl("study", "mine", "--json", "--write-tuned", cwd=finished)
     assert shown.returncode == 0, shown.stderr
     found = json.loads(shown.stdout)
-    assert found["settings"][0]["verdict"] == "winner"
+    assert found["configurations"][0]["verdict"] == "winner"
     kept = finished / "conf" / "tuned_values" / "scilab_rl.testing:TinyReach" / "sac.yaml"
     assert "gamma" in kept.read_text()
     again = scilab_rl("study", "mine", "--write-tuned", cwd=finished)
@@ -209,7 +207,7 @@ def test_grid_runs_each_combination_once_and_says_what_failed(tmp_path: Path) ->
 
 
 def test_paper_s_search_runs_unchanged(tmp_path: Path) -> None:
-    """Appendix A.2, from the desk, with smaller numbers on the command line."""
+    """Appendix A.2, from the project folder, with smaller numbers on the command line."""
     shutil.copytree(ROOT / "conf", tmp_path / "conf")
     for name in ("custom_algorithms", "custom_envs"):
         shutil.copytree(ROOT / "src" / name, tmp_path / "src" / name)
@@ -217,6 +215,7 @@ def test_paper_s_search_runs_unchanged(tmp_path: Path) -> None:
         "+performance=FetchPush/sac_var-opti", "--multirun", "hydra.sweeper.max_trials=2",
         "hydra.sweeper.min_trials_per_param=1", "hydra.sweeper.n_final_runs=1", "n_epochs=1",
         "eval_after_n_steps=60", "n_test_rollouts=1", "algorithm.buffer_size=1000", "mlflow=0",
+        "require_updates=false",
         cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr

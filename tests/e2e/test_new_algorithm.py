@@ -1,4 +1,4 @@
-"""A beginner's walk: copy an algorithm, take its exam, change five lines, train, resume, play."""
+"""A beginner's walk: copy an algorithm, test it, change five lines, train, resume, play."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from scilab_rl.cli import run_command_line
+from scilab_rl.cli.main import run_command_line
 
 from .commands import QUICK, TINY, last_run, quiet_environment, scilab_rl
 
@@ -23,15 +23,15 @@ CHANGES = {
             "        action_cost: float = 0.1,\n",
         ),
         (
-            "        self.learning_rate = learning_rate\n",
-            "        self.learning_rate = learning_rate\n        self.action_cost = action_cost\n",
+            "        self.n_critics = n_critics\n",
+            "        self.n_critics = n_critics\n        self.action_cost = action_cost\n",
         ),
         (
-            "            batch = self.sample(self.batch_size)\n",
-            "            batch = self.sample(self.batch_size)\n"
-            "            cost = self.action_cost * batch.actions.square().sum(1, keepdim=True)\n"
-            "            batch = batch._replace(rewards=batch.rewards - cost)\n"
-            '            self.logger.record("train/action_cost", cost.mean())\n',
+            "        actions, log_prob = self.actor.sample(batch.observations)\n",
+            "        cost = self.action_cost * batch.actions.square().sum(1, keepdim=True)\n"
+            "        batch = batch._replace(rewards=batch.rewards - cost)\n"
+            '        self.logger.record("train/action_cost", cost.mean())\n'
+            "        actions, log_prob = self.actor.sample(batch.observations)\n",
         ),
     ],
     "conf/algorithm/gentle.yaml": [
@@ -54,27 +54,27 @@ def take_exam(folder: Path, name: str, *options: str) -> subprocess.CompletedPro
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An empty folder, which is all that somebody has who installed with pip."""
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(sys, "path", list(sys.path))  # the desk joins it
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the project folder joins it
     return tmp_path
 
 
 @pytest.mark.slow
-def test_from_a_copy_to_a_trained_idea(desk: Path) -> None:
-    made = scilab_rl("new", "algorithm", "gentle", "--from", "cleansac", cwd=desk)
+def test_from_a_copy_to_a_trained_idea(project: Path) -> None:
+    made = scilab_rl("new", "algorithm", "gentle", "--from", "cleansac", cwd=project)
     assert made.returncode == 0, made.stderr
-    exam = take_exam(desk, "gentle")
-    assert exam.returncode == 0, exam.stdout
-    assert " passed" in exam.stdout
+    contract = take_exam(project, "gentle")
+    assert contract.returncode == 0, contract.stdout
+    assert " passed" in contract.stdout
 
     for name, changes in CHANGES.items():
-        text = (desk / name).read_text()
+        text = (project / name).read_text()
         for old, new in changes:
             assert text.count(old) == 1, old
             text = text.replace(old, new)
-        (desk / name).write_text(text)
+        (project / name).write_text(text)
 
     arguments = (
         "algorithm=gentle",
@@ -83,17 +83,17 @@ def test_from_a_copy_to_a_trained_idea(desk: Path) -> None:
         "eval_after_n_steps=500",
         "save_model_freq=500",
     )
-    trained = scilab_rl(*arguments, "n_epochs=4", cwd=desk, timeout=300)
+    trained = scilab_rl(*arguments, "n_epochs=4", cwd=project, timeout=300)
     assert trained.returncode == 0, trained.stderr
-    run = last_run(desk)
+    run = last_run(project)
     result = json.loads((run / "result.json").read_text())
     assert (result["status"], result["steps"]) == ("finished", 2000)
     assert "train/action_cost" in (run / "metrics.csv").read_text().splitlines()[0]
 
-    resumed = scilab_rl("resume", "last", "n_epochs=5", cwd=desk, timeout=300)
+    resumed = scilab_rl("resume", "last", "n_epochs=5", cwd=project, timeout=300)
     assert resumed.returncode == 0, resumed.stderr
     assert json.loads((run / "result.json").read_text())["steps"] == 2500
-    played = scilab_rl("play", "last", "--episodes", "3", cwd=desk)
+    played = scilab_rl("play", "last", "--episodes", "3", cwd=project)
     assert played.returncode == 0, played.stderr
     assert "algorithm: gentle" in played.stdout
     assert "95 % interval" in played.stdout
@@ -101,19 +101,19 @@ def test_from_a_copy_to_a_trained_idea(desk: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("parent", ["cleanppo", "sac", "td3", "ddpg", "dqn", "crossq", "ppo"])
-def test_copy_takes_its_exam_unchanged(parent: str, desk: Path) -> None:
-    made = scilab_rl("new", "algorithm", "idea", "--from", parent, cwd=desk)
+def test_copy_takes_its_exam_unchanged(parent: str, project: Path) -> None:
+    made = scilab_rl("new", "algorithm", "idea", "--from", parent, cwd=project)
     assert made.returncode == 0, made.stderr
-    exam = take_exam(desk, "idea", "-m", "not slow")
-    assert exam.returncode == 0, exam.stdout
+    contract = take_exam(project, "idea", "-m", "not slow")
+    assert contract.returncode == 0, contract.stdout
 
 
-def test_what_is_written(desk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_is_written(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run_command_line(["new", "algorithm", "sac_var2", "--from", "sac"]) == 0
     printed = capsys.readouterr().out
     assert "python -m pytest tests/test_sac_var2.py" in printed
     assert "scilab-rl algorithm=sac_var2 env=FetchReach" in printed
-    assert files_in(desk) == [
+    assert files_in(project) == [
         "conf/algorithm/sac_var2.yaml",
         "src/custom_algorithms/__init__.py",
         "src/custom_algorithms/sac_var2.py",
@@ -122,18 +122,18 @@ def test_what_is_written(desk: Path, capsys: pytest.CaptureFixture[str]) -> None
     shipped = Path(sys.modules["scilab_rl"].__file__).parent / "conf" / "algorithm" / "sac.yaml"
     expected = yaml.safe_load(shipped.read_text())
     expected |= {"name": "sac_var2", "_target_": "custom_algorithms.sac_var2.SAC_VAR2"}
-    text = (desk / "conf/algorithm/sac_var2.yaml").read_text()
+    text = (project / "conf/algorithm/sac_var2.yaml").read_text()
     assert list(yaml.safe_load(text).items()) == list(expected.items())
     assert "# auto, auto_0.1 (initial value) or a fixed number" in text  # comments stay
 
 
-def test_only_names_differ_from_the_parent(desk: Path) -> None:
+def test_only_names_differ_from_the_parent(project: Path) -> None:
     import inspect
 
     from stable_baselines3.sac import sac
 
     assert run_command_line(["new", "algorithm", "calm", "--from", "sac"]) == 0
-    copy = (desk / "src/custom_algorithms/calm.py").read_text().splitlines()
+    copy = (project / "src/custom_algorithms/calm.py").read_text().splitlines()
     parent = inspect.getsource(sac).splitlines()
     added = [line for line in copy if line not in parent]
     assert added == [
@@ -141,12 +141,19 @@ def test_only_names_differ_from_the_parent(desk: Path) -> None:
         'SelfCALM = TypeVar("SelfCALM", bound="CALM")',
         "class CALM(OffPolicyAlgorithm):",
         "    supported_action_spaces = (spaces.Box,)",
+        "    metrics = (",
+        *(
+            f'        "train/{name}",'
+            for name in ("n_updates", "learning_rate", "actor_loss", "critic_loss", "ent_coef")
+        ),
+        '        ("train/ent_coef_loss", "ent_coef is auto"),',
+        "    )",
         "        self: SelfCALM,",
         '        tb_log_name: str = "CALM",',
         "    ) -> SelfCALM:",
     ]
     assert copy[0].startswith("# A copy of stable_baselines3/sac/sac.py (stable_baselines3 2.")
-    assert "MIT licence" in copy[0]
+    assert "MIT license" in copy[0]
     assert "Soft Actor-Critic (SAC)" in "\n".join(copy)  # prose stays
 
 
@@ -154,76 +161,76 @@ def test_only_names_differ_from_the_parent(desk: Path) -> None:
     ("parent", "env"), [("dqn", "CartPole-v1"), ("crossq", "Pendulum-v1"), ("td3", "FetchReach")]
 )
 def test_suggested_environment_fits(
-    parent: str, env: str, desk: Path, capsys: pytest.CaptureFixture[str]
+    parent: str, env: str, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run_command_line(["new", "algorithm", "idea", "--from", parent]) == 0
     assert f"algorithm=idea env={env}" in capsys.readouterr().out
 
 
-def test_a_copy_of_a_copy(desk: Path) -> None:
-    """The desk's own algorithms are parents too; in a process of its own, as a user does it."""
+def test_a_copy_of_a_copy(project: Path) -> None:
+    """A project's own algorithms are parents too; in a new process, as a user does it."""
     for name, parent in (("first", "cleanppo"), ("second", "first")):
-        made = scilab_rl("new", "algorithm", name, "--from", parent, cwd=desk)
+        made = scilab_rl("new", "algorithm", name, "--from", parent, cwd=project)
         assert made.returncode == 0, made.stderr
-    source = (desk / "src/custom_algorithms/second.py").read_text()
+    source = (project / "src/custom_algorithms/second.py").read_text()
     assert source.startswith("# A copy of custom_algorithms/first.py.")
     assert "class SECOND(OneFileAlgorithm):" in source
-    listed = scilab_rl("algorithms", "--json", cwd=desk)
+    listed = scilab_rl("algorithms", "--json", cwd=project)
     rows = {row["algorithm"]: row for row in json.loads(listed.stdout)}
     assert rows["second"]["class"] == "custom_algorithms.second.SECOND"
     assert rows["second"]["problem"] is None
 
 
 REFUSED = [
-    (["sac"], "There is an algorithm 'sac' already (shipped)"),
-    (["mine"], "There is an algorithm 'mine' already (yours)"),
-    (["class"], "a word of Python"),
-    (["none"], "a word of Python"),
-    (["null"], "no text in YAML"),
-    (["on"], "no text in YAML"),
-    (["nan"], "no text in YAML"),
-    (["../idea"], "no path"),
-    (["folder/idea"], "no path"),
-    (["/tmp/idea"], "no path"),
-    (["idea.py"], "no name for an algorithm"),
-    (["2nd_idea"], "no name for an algorithm"),
-    (["my-idea"], "no name for an algorithm"),
-    (["MyIdea"], "no name for an algorithm"),
-    (["_idea"], "no name for an algorithm"),
-    (["ideä"], "no name for an algorithm"),
-    ([""], "no name for an algorithm"),
-    (["i" * 61], "no name for an algorithm"),
+    (["sac"], "The algorithm 'sac' already exists (shipped)"),
+    (["mine"], "The algorithm 'mine' already exists (yours)"),
+    (["class"], "a keyword of Python"),
+    (["none"], "a keyword of Python"),
+    (["null"], "not read as text by YAML"),
+    (["on"], "not read as text by YAML"),
+    (["nan"], "not read as text by YAML"),
+    (["../idea"], "not a path"),
+    (["folder/idea"], "not a path"),
+    (["/tmp/idea"], "not a path"),
+    (["idea.py"], "not a valid name for an algorithm"),
+    (["2nd_idea"], "not a valid name for an algorithm"),
+    (["my-idea"], "not a valid name for an algorithm"),
+    (["MyIdea"], "not a valid name for an algorithm"),
+    (["_idea"], "not a valid name for an algorithm"),
+    (["ideä"], "not a valid name for an algorithm"),
+    ([""], "not a valid name for an algorithm"),
+    (["i" * 61], "not a valid name for an algorithm"),
     (["f"], "would hide F"),
     (["idea", "--from", "sacc"], "Did you mean 'sac'?"),
     (["idea", "--form", "sac"], "Did you mean '--from'?"),
     ([], "required: name"),
-    (["package"], "'src/custom_algorithms/package' exists already"),
-    (["examined"], "'tests/test_examined.py' exists already"),
+    (["package"], "'src/custom_algorithms/package' already exists"),
+    (["examined"], "'tests/test_examined.py' already exists"),
 ]
 
 
 @pytest.mark.parametrize(("words", "message"), REFUSED)
 def test_refused_names_write_nothing(
-    words: list[str], message: str, desk: Path, capsys: pytest.CaptureFixture[str]
+    words: list[str], message: str, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (desk / "conf/algorithm").mkdir(parents=True)
-    (desk / "conf/algorithm/mine.yaml").write_text(
+    (project / "conf/algorithm").mkdir(parents=True)
+    (project / "conf/algorithm/mine.yaml").write_text(
         "name: mine\n_target_: custom_algorithms.mine.M\n"
     )
-    (desk / "src/custom_algorithms/package").mkdir(parents=True)
-    (desk / "tests").mkdir()
-    (desk / "tests/test_examined.py").touch()
-    before = files_in(desk)
+    (project / "src/custom_algorithms/package").mkdir(parents=True)
+    (project / "tests").mkdir()
+    (project / "tests/test_examined.py").touch()
+    before = files_in(project)
     assert run_command_line(["new", "algorithm", *words]) == 2
     (line,) = capsys.readouterr().err.strip().splitlines()
     assert message in line
-    assert files_in(desk) == before
+    assert files_in(project) == before
 
 
 def test_nothing_stays_when_a_file_cannot_be_written(
-    desk: Path, capsys: pytest.CaptureFixture[str]
+    project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (desk / "tests").touch()  # no folder can be made here
+    (project / "tests").touch()  # no folder can be made here
     assert run_command_line(["new", "algorithm", "idea"]) == 2
     assert "cannot be written" in capsys.readouterr().err
-    assert files_in(desk) == ["tests"]
+    assert files_in(project) == ["tests"]

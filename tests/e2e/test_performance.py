@@ -19,8 +19,6 @@ n_test_rollouts: 2
 mlflow: 0
 
 performance_testing_conditions:
-  total_runs: 3
-  succ_runs: 2
   eval_columns: eval/mean_reward
   eval_value: {value}
   max_steps: 40
@@ -31,8 +29,8 @@ performance_testing_conditions:
 
 
 @pytest.fixture
-def desk(tmp_path: Path) -> Path:
-    """A desk with a test that random actions pass and one that they cannot pass."""
+def project(tmp_path: Path) -> Path:
+    """A project with a test that random actions pass and one that they cannot pass."""
     folder = tmp_path / "conf" / "performance" / "Tiny"
     folder.mkdir(parents=True)
     env = "scilab_rl.testing:TinyBox-v0"
@@ -41,55 +39,55 @@ def desk(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_the_papers_command_runs_a_performance_test(desk: Path) -> None:
-    done = scilab_rl("+performance=Tiny/easy-test", "--multirun", cwd=desk)
+def test_the_papers_command_runs_a_performance_test(project: Path) -> None:
+    done = scilab_rl("+performance=Tiny/easy-test", "--multirun", cwd=project)
     assert done.returncode == 0, done.stderr
     assert "Tiny/easy-test: pass." in done.stderr
-    report = json.loads((desk / "data" / "performance" / "report.json").read_text())
+    report = json.loads((project / "data" / "performance" / "report.json").read_text())
     assert report[0]["outcome"] == "pass"
     assert report[0]["runs"][0]["steps"] == 40
     assert len({run["seed"] for run in report[0]["runs"]}) == len(report[0]["runs"])
 
 
-def test_a_failed_test_has_exit_code_1(desk: Path) -> None:
-    done = scilab_rl("+performance=Tiny/impossible-test", "--multirun", cwd=desk)
+def test_a_failed_test_has_exit_code_1(project: Path) -> None:
+    done = scilab_rl("+performance=Tiny/impossible-test", "--multirun", cwd=project)
     assert done.returncode == 1
     assert "did not pass, first Tiny/impossible-test (fail)" in done.stderr
 
 
-def test_without_multirun_the_file_is_one_run(desk: Path) -> None:
-    done = scilab_rl("+performance=Tiny/easy-test", "seed=1", "n_epochs=1", cwd=desk)
+def test_without_multirun_the_file_is_one_run(project: Path) -> None:
+    done = scilab_rl("+performance=Tiny/easy-test", "seed=1", "n_epochs=1", cwd=project)
     assert done.returncode == 0, done.stderr
-    assert "performance_testing_conditions" not in (desk / "data/last/config.yaml").read_text()
+    assert "performance_testing_conditions" not in (project / "data/last/config.yaml").read_text()
 
 
-def test_a_sweep_inside_a_test_is_refused(desk: Path) -> None:
-    done = scilab_rl("+performance=Tiny/easy-test", "n_envs=1,2", "--multirun", cwd=desk)
+def test_a_sweep_inside_a_test_is_refused(project: Path) -> None:
+    done = scilab_rl("+performance=Tiny/easy-test", "n_envs=1,2", "--multirun", cwd=project)
     assert done.returncode == 2
     assert "one value of each key" in done.stderr
 
 
-def test_the_command_selects_runs_reports_and_keeps_baselines(desk: Path) -> None:
-    listed = scilab_rl("performance", "Tiny/", "--list", cwd=desk)
+def test_the_command_selects_runs_reports_and_keeps_baselines(project: Path) -> None:
+    listed = scilab_rl("performance", "Tiny/", "--list", cwd=project)
     assert [line.split("\t")[0] for line in listed.stdout.splitlines()[1:]] == [
         "Tiny/easy-test", "Tiny/impossible-test",
     ]  # fmt: skip
-    done = scilab_rl("performance", "Tiny/", "--jobs", "1", "--write-baselines", cwd=desk)
+    done = scilab_rl("performance", "Tiny/", "--jobs", "1", "--write-baselines", cwd=project)
     assert done.returncode == 1, done.stderr
     rows = [line.split("\t")[:2] for line in done.stdout.splitlines()[1:]]
     assert rows == [["Tiny/easy-test", "pass"], ["Tiny/impossible-test", "fail"]]
-    stored = json.loads((desk / "baselines" / "Tiny" / "easy-test.json").read_text())
+    stored = json.loads((project / "baselines" / "Tiny" / "easy-test.json").read_text())
     assert stored["source"]["fingerprint"] and stored["source"]["versions"]["torch"]
     assert stored["runs"][0]["curve_steps"] == [20, 40]
 
-    again = scilab_rl("performance", "Tiny/easy", cwd=desk)
+    again = scilab_rl("performance", "Tiny/easy", cwd=project)
     assert again.returncode == 0
     assert "run 1" not in again.stderr  # nothing was trained again
-    assert "against the baseline: +0 in the mean" in again.stdout
+    assert "compared with the baseline: mean +0" in again.stdout
 
 
-def test_an_unknown_test_is_named(desk: Path) -> None:
-    done = scilab_rl("performance", "FetchReech/sac_her-test", cwd=desk)
+def test_an_unknown_test_is_named(project: Path) -> None:
+    done = scilab_rl("performance", "FetchReech/sac_her-test", cwd=project)
     assert done.returncode == 2
     assert "Did you mean 'FetchReach/sac_her-test'?" in done.stderr
 

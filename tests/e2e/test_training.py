@@ -28,7 +28,7 @@ from .commands import (
 @pytest.fixture(scope="module")
 def finished_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One complete run, shared by the tests that only look at it."""
-    folder = tmp_path_factory.mktemp("desk")
+    folder = tmp_path_factory.mktemp("project")
     done = scilab_rl("algorithm=sac", TINY, *QUICK, "info=a note", cwd=folder)
     assert done.returncode == 0, done.stderr
     return folder
@@ -95,6 +95,7 @@ def test_restored_policy_acts_as_the_saved_one(finished_run: Path) -> None:
     wanted = json.loads((last_run(finished_run) / "result.json").read_text())
     done = scilab_rl(
         "algorithm=sac", TINY, *QUICK, "n_epochs=1", "algorithm.learning_starts=1000",
+        "require_updates=false",
         f"+restore_policy={policy}", cwd=finished_run,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
@@ -122,7 +123,9 @@ def test_killed_and_resumed_equals_uninterrupted(algorithm: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_polite_stop_saves_a_checkpoint(number: signal.Signals, code: int, tmp_path: Path) -> None:
+def test_graceful_shutdown_saves_a_checkpoint(
+    number: signal.Signals, code: int, tmp_path: Path
+) -> None:
     arguments = ["algorithm=sac", TINY, *QUICK, "n_epochs=1000"]
     process = _start_and_signal(arguments, tmp_path, number)
     assert process.returncode == code
@@ -169,7 +172,8 @@ def test_fetch_reach_runs_with_a_paper_era_id(tmp_path: Path) -> None:
     done = scilab_rl(
         "algorithm=sac", "env=FetchReach-v2", "wandb=0", "n_epochs=1", "eval_after_n_steps=60",
         "n_test_rollouts=1", "seed=1", "mlflow=0", "+env_kwargs.reward_type=dense",
-        "algorithm.buffer_size=1000", "render=record", cwd=tmp_path,
+        "algorithm.buffer_size=1000", "algorithm.learning_starts=50", "render=record",
+        cwd=tmp_path,
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     assert "FetchReach-v2 is not available any more; using FetchReach-v4." in done.stderr

@@ -15,13 +15,14 @@ import numpy as np
 import pytest
 import torch
 
-from scilab_rl.training.foreign import TRUST_VARIABLE
+from scilab_rl.training.sb3_archives import TRUST_VARIABLE
 
 from .commands import QUICK, TINY, last_run, quiet_environment, scilab_rl
 
 ENV_ID = TINY.partition("=")[2]
 SMALL = "algorithm.policy_kwargs={net_arch: [16, 16]}"
-UNTOUCHED = (TINY, *QUICK, "n_epochs=1", "algorithm.learning_starts=1000", SMALL)
+UNTOUCHED = (TINY, *QUICK, "n_epochs=1", "algorithm.learning_starts=1000", SMALL,
+             "require_updates=false")  # fmt: skip
 
 
 class Canary:
@@ -147,7 +148,7 @@ WRONG = [
     (("play", "ARCHIVE", "--trust-pickle"), "algorithm=sac env=FetchReach --trust-pickle"),
     (("play", "ARCHIVE", "algorithm=cleansac", TINY, "--trust-pickle"), "one-file algorithm"),
     (("play", "nowhere.zip", "--trust-pickle"), "No run 'nowhere.zip'"),
-    (("play", "last", "algorithm=sac"), "a run is played as it was trained"),
+    (("play", "last", "algorithm=sac"), "a run keeps its configuration"),
     (("algorithm=sac", TINY, "restore_policy=nowhere.zip"), "no saved policy in 'nowhere.zip'"),
 ]
 
@@ -161,7 +162,7 @@ def test_what_cannot_be_is_refused(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    from scilab_rl.cli import run_command_line
+    from scilab_rl.cli.main import run_command_line
 
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(os.environ, TRUST_VARIABLE, "0")

@@ -19,19 +19,20 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from scilab_rl.testing import decode_frame
-from scilab_rl.visualization import movie
-from scilab_rl.visualization.archive import load_clip
-from scilab_rl.visualization.live import LiveViewer
-from scilab_rl.visualization.movie import HEADER, MovieFrames
-from scilab_rl.visualization.panels import COLOURS
-from scilab_rl.visualization.records import (
+from scilab_rl.drawing import COLORS
+from scilab_rl.metrics.probes import Curve
+from scilab_rl.recording import movie
+from scilab_rl.recording.live import LiveViewer
+from scilab_rl.recording.movie import HEADER, MovieFrames
+from scilab_rl.recording.records import (
     Clip,
     ClipInfo,
     Record,
     decode_picture,
     encode_picture,
+    load_clip,
 )
+from scilab_rl.testing import decode_frame
 
 from .chromium import EXECUTABLE, Chromium
 from .commands import last_run, quiet_environment
@@ -46,6 +47,10 @@ ALGORITHM = """
 
 
     class COUNTING(RANDOM):
+        metrics = (
+            "train/step_before", "train/step_after", "train/episode_lazily", "train/after_update",
+        )
+
         def iterate(self, callback):
             callback.on_rollout_start()
             episode, step = self._last_obs[0]
@@ -99,18 +104,18 @@ RECORDED = [f"train/{name}" for name in ("step_before", "step_after", "episode_l
 @pytest.fixture(scope="module", params=[1, 4])
 def clips(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """The recordings of a run with two epochs, both rendered."""
-    desk = tmp_path_factory.mktemp(f"desk{request.param}")
-    (desk / "src" / "custom_algorithms").mkdir(parents=True)
-    (desk / "conf" / "algorithm").mkdir(parents=True)
-    (desk / "src" / "custom_algorithms" / "__init__.py").touch()
-    (desk / "src" / "custom_algorithms" / "counting.py").write_text(textwrap.dedent(ALGORITHM))
-    (desk / "src" / "custom_probes.py").write_text(textwrap.dedent(PROBES))
-    (desk / "conf" / "algorithm" / "counting.yaml").write_text(
+    project = tmp_path_factory.mktemp(f"project{request.param}")
+    (project / "src" / "custom_algorithms").mkdir(parents=True)
+    (project / "conf" / "algorithm").mkdir(parents=True)
+    (project / "src" / "custom_algorithms" / "__init__.py").touch()
+    (project / "src" / "custom_algorithms" / "counting.py").write_text(textwrap.dedent(ALGORITHM))
+    (project / "src" / "custom_probes.py").write_text(textwrap.dedent(PROBES))
+    (project / "conf" / "algorithm" / "counting.yaml").write_text(
         "name: counting\n_target_: custom_algorithms.counting.COUNTING\n"
     )
     own = ",".join(OWN)
     done = run(
-        desk,
+        project,
         "algorithm=counting",
         f"env={ENV}",
         "render=record",
@@ -124,16 +129,16 @@ def clips(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
         "mlflow=0",
     )
     assert done.returncode == 0, done.stderr
-    recordings = sorted((last_run(desk) / "episodes").glob("*.npz"))
+    recordings = sorted((last_run(project) / "episodes").glob("*.npz"))
     assert [path.name.partition("_")[0] for path in recordings] == ["eval"] * 2 + ["train"] * 2
     return recordings
 
 
-def run(desk: Path, *arguments: str) -> subprocess.CompletedProcess:
-    """Run the installed program: src/main.py would find its own desk first."""
+def run(project: Path, *arguments: str) -> subprocess.CompletedProcess:
+    """Run the installed program: src/main.py would find its own project first."""
     return subprocess.run(
-        [sys.executable, "-m", "scilab_rl.cli", *arguments],
-        cwd=desk,
+        [sys.executable, "-m", "scilab_rl.cli.main", *arguments],
+        cwd=project,
         env=quiet_environment(),
         capture_output=True,
         text=True,
@@ -143,7 +148,7 @@ def run(desk: Path, *arguments: str) -> subprocess.CompletedProcess:
 
 
 def expected(episode: int, step: int, phase: str) -> dict[str, float]:
-    """Return all curves of a scene, from nothing but the numbers in its pixels."""
+    """Return all numbers of a scene, from nothing but the numbers in its pixels."""
     values: dict[str, float] = {
         "custom_probes.episode": episode,
         "custom_probes.step": step,
@@ -176,8 +181,9 @@ def test_recorded_numbers_belong_to_their_frame(clips: list[Path]) -> None:
             assert step == record.step == index
             np.testing.assert_array_equal(record.observation, [episode, step])
             wanted = expected(episode, step, record.phase)
-            assert record.values == pytest.approx(wanted, rel=1e-6), (path.name, step)
-            assert record.values.keys() == wanted.keys()
+            shown = {curve.panel: number for curve, number in record.values.items()}
+            assert shown == pytest.approx(wanted, rel=1e-6), (path.name, step)
+            assert record.values.keys() == set(map(Curve, wanted))
 
 
 def test_page_shows_the_numbers_of_its_scene(clips: list[Path]) -> None:
@@ -217,13 +223,13 @@ def test_live_view_draws_scene_and_curves_in_the_browser() -> None:
         viewer.begin(info)
         for step in range(30):
             record = Record("eval", 0, 0, step, step, picture, np.zeros(1), np.zeros(1), 1.0)
-            record.values = {"reward": float(step)}
+            record.values = {Curve("reward"): float(step)}
             viewer.add(record)
 
-        def n_pixels(colour: tuple[int, int, int]) -> int:
+        def n_pixels(color: tuple[int, int, int]) -> int:
             with Image.open(io.BytesIO(browser.screenshot())) as image:
                 pixels = np.asarray(image.convert("RGB")).astype(int)
-            return int((np.abs(pixels - colour).max(axis=2) < 40).sum())
+            return int((np.abs(pixels - color).max(axis=2) < 40).sum())
 
         with Chromium() as browser:
             browser.open(str(viewer.address))
@@ -292,9 +298,9 @@ def _with_panels(clip: Clip, n_panels: int) -> Clip:
         dataclasses.replace(
             record,
             values={
-                new: record.values[name]
+                Curve(new): record.values[Curve(name)]
                 for new, name in zip(new_names, names, strict=True)
-                if name in record.values
+                if Curve(name) in record.values
             },
         )
         for record in clip.records
@@ -320,10 +326,10 @@ def _scene_of(frame: np.ndarray, layout: MovieFrames) -> np.ndarray:
 
 
 def _has_dot(frame: np.ndarray, layout: MovieFrames, x: float, y: float) -> bool:
-    """Tell whether the middle of a curve's dot is here, after video compression."""
+    """Return whether the middle of a curve's dot is here, after video compression."""
     row, column = round(y) + HEADER, round(x) + layout.scene_size[0]
     middle = frame[row - 1 : row + 2, column - 1 : column + 2].reshape(-1, 3).mean(axis=0)
-    red, green, blue = (int(COLOURS[0][i : i + 2], 16) for i in (1, 3, 5))
+    red, green, blue = (int(COLORS[0][i : i + 2], 16) for i in (1, 3, 5))
     return bool(np.abs(middle - [red, green, blue]).max() < 60)
 
 
@@ -356,7 +362,7 @@ def test_recorded_names_are_refused_at_evaluation_and_the_probe_is_named(tmp_pat
         "algorithm=cleansac",
         "env=FetchReach",
         "render=record",
-        "render_metrics_test=[train/critic_variance]",
+        "render_metrics_test=[train/target_critic_variance]",
         "mlflow=0",
     )
     assert done.returncode == 2

@@ -1,4 +1,4 @@
-"""A wheel in an empty folder: no desk, no repository, and still the whole command line."""
+"""A wheel in an empty folder: no project, no repository, and still the whole command line."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from .commands import QUICK, ROOT, TINY, last_run, quiet_environment
 
 
 def test_wheel_trains_in_an_empty_folder(tmp_path: Path) -> None:
-    site, desk = tmp_path / "site", tmp_path / "desk"
-    desk.mkdir()
+    site, project = tmp_path / "site", tmp_path / "project"
+    project.mkdir()
     copy = tmp_path / "source"
     subprocess.run(
         ["git", "-c", "safe.directory=*", "clone", "--quiet", "--local", str(ROOT), str(copy)],
@@ -22,11 +22,12 @@ def test_wheel_trains_in_an_empty_folder(tmp_path: Path) -> None:
     subprocess.run(
         [*pip, "install", *offline, "--target", str(site), str(copy)], check=True, cwd=tmp_path
     )
-    assert not (site / "custom_algorithms").exists(), "the desk belongs to the researcher"
+    assert not (site / "custom_algorithms").exists(), "the project folder belongs to the researcher"
     assert (site / "scilab_rl" / "conf" / "main.yaml").is_file()
+    assert (site / "scilab_rl" / "templates" / "style.css").is_file()
     done = subprocess.run(
-        [sys.executable, "-m", "scilab_rl.cli", "algorithm=sac", TINY, *QUICK, "n_epochs=1"],
-        cwd=desk,
+        [sys.executable, "-m", "scilab_rl.cli.main", "algorithm=sac", TINY, *QUICK, "n_epochs=2"],
+        cwd=project,
         env=quiet_environment(PYTHONPATH=str(site)),
         capture_output=True,
         text=True,
@@ -34,4 +35,4 @@ def test_wheel_trains_in_an_empty_folder(tmp_path: Path) -> None:
     )
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
-    assert (last_run(desk) / "rl_model_finished" / "manifest.json").is_file()
+    assert (last_run(project) / "rl_model_finished" / "manifest.json").is_file()

@@ -23,7 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from scilab_rl.files import FAULT_VARIABLE
-from scilab_rl.results import all_runs, find_run
+from scilab_rl.run.directory import all_runs, find_run
 
 from .environment import ID
 
@@ -42,10 +42,11 @@ _CLONE_NEWNS, _CLONE_NEWUSER, _CLONE_NEWNET = 0x00020000, 0x10000000, 0x40000000
 
 _server = multiprocessing.get_context("forkserver")
 _server.set_forkserver_preload(
-    ["scilab_rl.cli", "scilab_rl.experiment", "hydra", "stable_baselines3", "sb3_contrib",
-     "scilab_rl.training.trainer", "scilab_rl.training.showing", "scilab_rl.algorithms.cleansac",
-     "scilab_rl.provenance", "scilab_rl.envs.fingerprint", "rich.console",
-     "scilab_rl.hyperopt.folders", "tests.faults.environment"]
+    ["scilab_rl.cli.main", "scilab_rl.run.run", "hydra", "stable_baselines3", "sb3_contrib",
+     "scilab_rl.training.loop", "scilab_rl.recording.callback",
+     "scilab_rl.algorithms.cleansac",
+     "scilab_rl.run.provenance", "scilab_rl.envs.fingerprint", "rich.console",
+     "scilab_rl.search.folders", "tests.faults.environment"]
 )  # fmt: skip
 
 
@@ -80,7 +81,7 @@ class Process:
     Args:
         arguments: As typed.
         cwd: Its folder.
-        fault: See `scilab_rl.files.crash_point`.
+        fault: See `scilab_rl.files.fault_point`.
         file_limit: Most bytes of a file, after which writing fails.
         disk: Size of the disk that ``data`` is then, as ``mount`` wants it; ``read-only`` for one
             that cannot be written.
@@ -152,7 +153,7 @@ def _main(settings: dict[str, Any]) -> None:
         resource.setrlimit(resource.RLIMIT_FSIZE, (settings["file_limit"],) * 2)
     for package in settings["hidden"]:
         _hide(package)
-    from scilab_rl.cli import run_command_line
+    from scilab_rl.cli.main import run_command_line
 
     sys.argv = ["scilab-rl", *settings["arguments"]]
     code = run_command_line(list(settings["arguments"]))
@@ -201,7 +202,7 @@ def _enter_namespaces(disk: str, network: bool) -> None:
 
 
 def allows_namespaces() -> bool:
-    """Tell whether an ordinary user may have disks and networks of his own here."""
+    """Return whether an ordinary user may have disks and networks of his own here."""
     if not shutil.which("unshare"):
         return False
     return subprocess.run(["unshare", "-rmn", "true"], check=False).returncode == 0

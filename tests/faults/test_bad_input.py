@@ -12,28 +12,31 @@ from pathlib import Path
 import pytest
 import yaml
 
-from scilab_rl.algorithms.arguments import RANGES
-from scilab_rl.cli import run_command_line
-from scilab_rl.config import KEYS, LIST, MAPPING, NUMBER, SWITCH, TEXT, WHOLE, Key
-from scilab_rl.workspace import SHIPPED_CONF
+from scilab_rl.cli.main import run_command_line
+from scilab_rl.config.schema import BOOLEAN, INTEGER, KEYS, LIST, MAPPING, NUMBER, STRING, Key
+from scilab_rl.config.workspace import SHIPPED_CONF
+from scilab_rl.learning.arguments import RANGES
 
 from ..e2e.commands import command, quiet_environment
 from .harness import ENV
 
 _WRONG = {
     NUMBER: ("abc", "nan", "inf", "[1]", "{a: 1}", "true"),
-    WHOLE: ("abc", "1.5", "nan", "-inf", "[1]", "{a: 1}", "true", "''"),
-    TEXT: ("[1]", "{a: 1}", "1.5", "''"),
-    SWITCH: ("2", "abc", "[1]", "-1", "0.5", "''"),
+    INTEGER: ("abc", "1.5", "nan", "-inf", "[1]", "{a: 1}", "true", "''"),
+    STRING: ("[1]", "{a: 1}", "1.5", "''"),
+    BOOLEAN: ("2", "abc", "[1]", "-1", "0.5", "''"),
     MAPPING: ("5", "abc", "[1]"),
     LIST: ("5", "abc", "{a: 1}"),
 }
+# Any text is a note, a name or a place, also one that looks like a list.
+_FREE_TEXT = ("info", "project_name", "entity", "group", "base_logdir", "viewer_host")
 _MUST_SUGGEST = 0.9
 
 
 def values_that_cannot_be(key: Key) -> Iterator[str]:
     for value in _WRONG[key.kind]:
-        if not (key.name == "info" and value == "''"):
+        is_text = key.name in _FREE_TEXT and value != "''"
+        if not (is_text or (key.name == "info" and value == "''")):
             yield f"{key.name}={value}"
     if not key.optional:
         yield f"{key.name}=null"
@@ -41,7 +44,7 @@ def values_that_cannot_be(key: Key) -> Iterator[str]:
         yield f"{key.name}={int(key.low) - 1}"
     if key.high < float("inf"):
         yield f"{key.name}={int(key.high) + 1}"
-    if key.choices and key.kind == TEXT:
+    if key.choices and key.kind == STRING:
         yield f"{key.name}={key.choices[-1][:-1]}x"
 
 
@@ -98,7 +101,7 @@ def test_there_are_enough_cases() -> None:
 
 
 @pytest.fixture
-def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
@@ -106,8 +109,8 @@ def desk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 class Refusals:
     """Gives bad input and collects what was not refused as it should be."""
 
-    def __init__(self, capsys: pytest.CaptureFixture[str], desk: Path) -> None:
-        self.capsys, self.desk = capsys, desk
+    def __init__(self, capsys: pytest.CaptureFixture[str], project: Path) -> None:
+        self.capsys, self.project = capsys, project
         self.problems: list[str] = []
         self.messages: dict[str, str] = {}
 
@@ -122,7 +125,7 @@ class Refusals:
         captured = self.capsys.readouterr()
         lines = captured.err.strip().splitlines()
         errors = [line for line in lines if line.startswith("error: ")]
-        written = [path for path in self.desk.rglob("*") if path.is_file()]
+        written = [path for path in self.project.rglob("*") if path.is_file()]
         if code != 2 or len(errors) != 1 or "Traceback" in captured.err or written:
             self.problems.append(f"{typed}: code {code}, {len(written)} files: {captured.err!r}")
         elif "(unexpected;" in errors[0] or len(errors[0]) > 1500:
@@ -134,8 +137,8 @@ class Refusals:
 
 
 @pytest.fixture
-def refusals(desk: Path, capsys: pytest.CaptureFixture[str]) -> Refusals:
-    return Refusals(capsys, desk)
+def refusals(project: Path, capsys: pytest.CaptureFixture[str]) -> Refusals:
+    return Refusals(capsys, project)
 
 
 def every(cases: list, n: int) -> list:
@@ -228,6 +231,7 @@ NAMES = [
     ("algorithm=claendqn", "cleandqn"), ("algorithm=crosq", "crossq"), ("algorithm=dpg", "ddpg"),
     ("early_stop_data_column=eval/sucess_rate", "eval/success_rate"),
     ("hyperopt_criterion=eval/mean_rewrad", "eval/mean_reward"),
+    ("hyperopt_criterion=train/rollout_reward_step", "train/rollout_rewards_step"),
     ("hydra/launcher=locla", "local"), ("render=dispaly", "display"),
 ]  # fmt: skip
 
@@ -238,25 +242,55 @@ def test_f27_misspelled_names(refusals: Refusals) -> None:
     assert right >= _MUST_SUGGEST * len(NAMES), refusals.messages
 
 
+@pytest.mark.parametrize(
+    ("space", "message"),
+    [
+        ("{++algorithm.target_entropy:{type:float,low:-3,high:-1,when:{algorithm.ent_coef:Auto}}}",
+         "Did you mean 'auto'?"),
+        ("{++algorithm.tau:{type:int,low:5,high:1}}", "low <= high"),
+        ("{seed:{type:int,low:1,high:9}}", "leave seed out"),
+    ],
+)  # fmt: skip
+def test_search_spaces_that_cannot_be(refusals: Refusals, space: str, message: str) -> None:
+    told = refusals.give("--multirun", "algorithm=cleansac", f"hydra.sweeper.search_space={space}")
+    assert refusals.problems == []
+    assert message in told
+
+
+def test_one_critic_is_refused_where_its_variance_is_asked_for(
+    project: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    one = ("algorithm=cleansac", "++algorithm.n_critics=1", "env=Reach1DOF-v0", "mlflow=0")
+    for asked, told in (
+        (("hyperopt_criterion=train/target_critic_variance",), "only when n_critics is above 1"),
+        (("render=record", "render_metrics_test=[critic_variance]"), "has no second critic"),
+        (("render=record", "record_when='critic_variance > 1'"), "record_when: cleansac cannot"),
+        (("++algorithm.intrinsic=critic_variance",), "two critics or more"),
+    ):
+        assert run_command_line([*one, *asked]) == 2
+        assert told in capsys.readouterr().err
+    assert not list(project.glob("data/*/*"))
+
+
 def test_f27_name_of_a_missing_suite_says_how_to_install_it(refusals: Refusals) -> None:
     message = refusals.give("env=PandaReach-v3")
     assert "pip install" in message or "Did you mean" in message
 
 
-def test_f28_as_processes_in_less_than_three_seconds(desk: Path) -> None:
+def test_f28_as_processes_in_less_than_three_seconds(project: Path) -> None:
     """The same through a shell; the time is that of the fastest, as other tests run beside it."""
     fastest = float("inf")
     for case in ("n_epochs=abc", "sead=3", "algorithm=sacc"):
         started = time.monotonic()
         done = subprocess.run(
-            command(case), cwd=desk, env=quiet_environment(), capture_output=True, text=True,
+            command(case), cwd=project, env=quiet_environment(), capture_output=True, text=True,
             check=False, timeout=60,
         )  # fmt: skip
         fastest = min(fastest, time.monotonic() - started)
         assert done.returncode == 2
         assert re.fullmatch(r"error: .+\n", done.stderr)
         assert done.stdout == ""
-    assert list(desk.iterdir()) == []
+    assert list(project.iterdir()) == []
     assert fastest < 6
 
 
@@ -297,7 +331,7 @@ BROKEN_FILES = {
 
 @pytest.mark.parametrize("name", BROKEN_FILES)
 def test_f08_broken_files_of_the_desk(name: str, refusals: Refusals) -> None:
-    folder = refusals.desk / "conf" / "algorithm"
+    folder = refusals.project / "conf" / "algorithm"
     folder.mkdir(parents=True)
     content = BROKEN_FILES[name]
     path = folder / "mine.yaml"
@@ -307,11 +341,11 @@ def test_f08_broken_files_of_the_desk(name: str, refusals: Refusals) -> None:
     assert code == 2, captured.err
     assert re.fullmatch(r"error: .+\n", captured.err), captured.err
     assert "(unexpected;" not in captured.err
-    assert [file for file in refusals.desk.rglob("*") if file.is_file()] == [path]
+    assert [file for file in refusals.project.rglob("*") if file.is_file()] == [path]
 
 
 def test_f08_file_cut_at_every_tenth(refusals: Refusals) -> None:
-    folder = refusals.desk / "conf" / "algorithm"
+    folder = refusals.project / "conf" / "algorithm"
     folder.mkdir(parents=True)
     whole = (SHIPPED_CONF / "algorithm" / "sac.yaml").read_text(encoding="utf-8")
     for tenth, suffix in itertools.product(range(10), ("", ": [")):

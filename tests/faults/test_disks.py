@@ -46,7 +46,7 @@ def test_f05_full_disk_costs_a_checkpoint_and_not_the_run(tmp_path: Path) -> Non
     assert full.code == 0, full.errors
     warnings = [line for line in full.errors.splitlines() if "No space left" in line]
     assert len(warnings) == 1
-    assert warnings[0].endswith("Training goes on.")
+    assert warnings[0].endswith("Training continues.")
     run = last_run(tmp_path)
     check_nothing_is_half(run)
     assert not list(run.rglob(".*.tmp"))

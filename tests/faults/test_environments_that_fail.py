@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import os
 import re
+import signal
+import subprocess
+import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from scilab_rl.envs.contract import END_EPISODE, IGNORE, STOP
-from scilab_rl.envs.vectorize import EnvSettings, make_train_env
-from scilab_rl.errors import EnvironmentError_, NumericalError
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.envs.run_env import END_EPISODE, IGNORE, STOP, RunEnv
+from scilab_rl.envs.vectorize import make_train_env
+from scilab_rl.errors import EnvironmentFailure, NumericalError
 from scilab_rl.training import resume
 from scilab_rl.training.watchdog import watchdog
 
@@ -41,14 +46,14 @@ BROKEN = [
           ("number", r"has shape \(\), but its space has \(2,\)"),
       ]],
     *[("missing", place, f"the observation has no '{place}'") for place in ENTRIES],
-    ("number", "whole", "the observation is of type float and no dictionary"),
-    ("none", "whole", "the observation is of type NoneType and no dictionary"),
-    ("none", "reward", "the reward is None and no number"),
-    ("words", "reward", "the reward is 'yes' and no number"),
+    ("number", "whole", "the observation is of type float and not a dictionary"),
+    ("none", "whole", "the observation is of type NoneType and not a dictionary"),
+    ("none", "reward", "the reward is None and not a number"),
+    ("words", "reward", "the reward is 'yes' and not a number"),
     ("none", "terminated", "terminated is None and not True or False"),
     ("number", "terminated", "terminated is 0.5 and not True or False"),
     ("words", "truncated", "truncated is 'yes' and not True or False"),
-    ("none", "info", "the info is None and no dictionary"),
+    ("none", "info", "the info is None and not a dictionary"),
 ]  # fmt: skip
 
 
@@ -58,10 +63,8 @@ def switched(**switches: Any) -> tuple[str, ...]:
 
 def act(n_steps: int = 20, *, on_nan: str = STOP, vector: str = "inprocess", **switches: Any):
     """Step the environment with observers, and return what they saw."""
-    settings = EnvSettings(
-        ID, switches, n_envs=2, seed=3, on_nan=on_nan, vector=vector, modules=[ID.split(":")[0]]
-    )
-    env = make_train_env(settings)
+    cfg = RunConfig(ID, switches, n_envs=2, seed=3, on_nan=on_nan, vector=vector)
+    env = make_train_env(cfg)
     seen: list[Any] = []
     env.observers.append(type("Observer", (), {"on_step": lambda self, step: seen.append(step)})())
     try:
@@ -79,7 +82,7 @@ def test_f10_no_number(fault: str, place: str, in_reset: bool) -> None:
     what = "reward" if place == "reward" else f"observation '{place}'"
     index = "()" if place == "reward" else "(1,)"
     message = rf"Faulty-v0: {what} is {fault} at index {re.escape(index)} of environment 0 after "
-    with pytest.raises(EnvironmentError_, match=message) as error:
+    with pytest.raises(EnvironmentFailure, match=message) as error:
         act(fault=fault, place=place, at=at, in_reset=in_reset)
     assert "last action [0.5 0.5]" in str(error.value)
 
@@ -89,7 +92,7 @@ def test_f10_no_number(fault: str, place: str, in_reset: bool) -> None:
 def test_f10_broken_contract(fault: str, place: str, message: str, in_reset: bool) -> None:
     if in_reset and place in ("reward", "terminated", "truncated", "info"):
         return
-    with pytest.raises(EnvironmentError_, match=message) as error:
+    with pytest.raises(EnvironmentFailure, match=message) as error:
         act(fault=fault, place=place, at=2 if in_reset else 5, in_reset=in_reset)
     text = str(error.value)
     assert re.search(r"Faulty-v0 broke its contract in step\(\) at train step \d+ \(seed 3\)", text)
@@ -116,8 +119,9 @@ def test_f10_and_it_can_be_ignored() -> None:
 
 
 def test_f10_out_of_bounds_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
-    settings = EnvSettings(ID, {"fault": "outside", "place": "achieved_goal", "at": 3})
-    env = make_train_env(settings)
+    env = make_train_env(
+        RunConfig(ID, {"fault": "outside", "place": "achieved_goal", "at": 3}, seed=1)
+    )
     env.reset()
     for _ in range(40):
         env.step(np.zeros((1, 2), np.float32))
@@ -126,8 +130,6 @@ def test_f10_out_of_bounds_is_told_once(caplog: pytest.LogCaptureFixture) -> Non
 
 
 def test_f10_goals_without_success_are_told(caplog: pytest.LogCaptureFixture) -> None:
-    from scilab_rl.envs.contract import ContractGuard
-
     from .environment import Faulty
 
     class Silent(Faulty):
@@ -135,7 +137,7 @@ def test_f10_goals_without_success_are_told(caplog: pytest.LogCaptureFixture) ->
             observation, reward, terminated, truncated, _ = super().step(action)
             return observation, reward, terminated, truncated, {}
 
-    env = DummyVecEnv([lambda: ContractGuard(Silent())])
+    env = DummyVecEnv([lambda: RunEnv(Silent())])
     env.reset()
     for _ in range(3):
         env.step(np.zeros((1, 2), np.float32))
@@ -190,7 +192,7 @@ def test_f09_what_was_learned_until_then_goes_on(tmp_path: Path) -> None:
     fault = switched(fault="raise", at=150, once=tmp_path / "happened")
     done = scilab_rl(*CLEANSAC, *fault, cwd=tmp_path)
     assert done.code == 1
-    assert "What was learned until step 149 is kept. Go on with: scilab-rl resume" in done.errors
+    assert "What was learned until step 149 is kept. Continue with: scilab-rl resume" in done.errors
     resumed = scilab_rl("resume", "last", cwd=tmp_path)
     assert resumed.code == 0, resumed.errors
     result = result_of(last_run(tmp_path))
@@ -198,9 +200,9 @@ def test_f09_what_was_learned_until_then_goes_on(tmp_path: Path) -> None:
 
 
 def test_f09_in_a_process_of_its_own() -> None:
-    with pytest.raises(EnvironmentError_, match=r"ValueError in step\(\).*: the gripper broke"):
+    with pytest.raises(EnvironmentFailure, match=r"ValueError in step\(\).*: the gripper broke"):
         act(fault="raise", at=4, vector="subprocess")
-    with pytest.raises(EnvironmentError_, match=r"broke its contract in step\(\).*has no 'ach"):
+    with pytest.raises(EnvironmentFailure, match=r"broke its contract in step\(\).*has no 'ach"):
         act(fault="missing", place="achieved_goal", at=4, vector="subprocess")
 
 
@@ -208,7 +210,7 @@ def test_f09_in_a_process_of_its_own() -> None:
 def test_f14_dead_worker_is_one_line_and_no_deadlock(vector: str) -> None:
     started = time.monotonic()
     message = r"its worker process \d ended with exit code -9, maybe out of memory"
-    with pytest.raises(EnvironmentError_, match=message):
+    with pytest.raises(EnvironmentFailure, match=message):
         act(fault="kill", at=4, vector=vector)
     assert time.monotonic() - started < 60  # most of it is starting the workers
     assert not living_children()
@@ -246,6 +248,31 @@ def test_f13_silent_while_all_is_well(tmp_path: Path, caplog: pytest.LogCaptureF
     with watchdog(lambda: 0, 0.1, tmp_path / "stack.txt"):
         time.sleep(0.5)
     assert caplog.text.count("No step for 0.1 s") == 1
+    assert "What it is doing is in" in caplog.text
+
+
+def test_f13_without_a_place_for_the_stack(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with watchdog(lambda: 0, 0.1, tmp_path / "missing" / "stack.txt"):
+        time.sleep(0.5)
+    assert "No step for 0.1 s" in caplog.text and "cannot be written" in caplog.text
+
+
+def test_f13_stack_is_written_while_a_simulator_holds_the_interpreter(tmp_path: Path) -> None:
+    """No Python thread runs from the call on, until the alarm kills the process."""
+    script = (
+        "import ctypes, signal, sys; from pathlib import Path\n"
+        "from scilab_rl.training.watchdog import watchdog\n"
+        "def simulator(): ctypes.PyDLL(None).usleep(900_000)\n"
+        "with watchdog(lambda: 0, 0.2, Path(sys.argv[1])):\n"
+        "    signal.setitimer(signal.ITIMER_REAL, 0.7)\n"
+        "    simulator()"
+    )
+    path = tmp_path / "stack.txt"
+    done = subprocess.run([sys.executable, "-c", script, str(path)], check=False)
+    assert done.returncode == -signal.SIGALRM
+    assert "in simulator" in path.read_text()
 
 
 @pytest.mark.parametrize(
@@ -270,17 +297,15 @@ def test_f12_no_number_in_the_weights_ends_the_run(
 def test_f12_one_poisoned_weight_is_found() -> None:
     import torch
 
-    from scilab_rl.training.trainer import Trainer
+    from scilab_rl.training.loop import refuse_nan
 
-    trainer = Trainer.__new__(Trainer)
     policy = torch.nn.Linear(2, 2)
-    trainer.model = type("Model", (), {"policy": policy, "learning_rate": 0.1, "gamma": 0.9})()
-    trainer.num_timesteps = 310
-    trainer.refuse_nan({"train/critic_loss": 1.0})
+    model = SimpleNamespace(policy=policy, learning_rate=0.1, gamma=0.9, num_timesteps=310)
+    refuse_nan(model, {"train/critic_loss": 1.0})
     with pytest.raises(NumericalError, match=r"train/critic_loss is nan after 310 steps \(learning_"
                                              r"rate=0.1, gamma=0.9\)"):  # fmt: skip
-        trainer.refuse_nan({"train/critic_loss": float("nan")})
+        refuse_nan(model, {"train/critic_loss": float("nan")})
     with torch.no_grad():
         policy.weight[1, 0] = float("inf")
     with pytest.raises(NumericalError, match="weight weight is nan after 310 steps"):
-        trainer.refuse_nan({"train/critic_loss": 1.0})
+        refuse_nan(model, {"train/critic_loss": 1.0})

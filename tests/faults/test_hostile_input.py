@@ -26,10 +26,11 @@ import numpy as np
 import pytest
 import torch
 
-from scilab_rl.cli import run_command_line
-from scilab_rl.masking import mask
-from scilab_rl.results import RunDirectory, find_run, slug
-from scilab_rl.visualization.live import free_port
+from scilab_rl.cli.main import run_command_line
+from scilab_rl.recording.live import free_port
+from scilab_rl.redaction import redact
+from scilab_rl.run.directory import RunDirectory, find_run, slug
+from scilab_rl.telemetry import SWITCHES
 
 from ..e2e.commands import ROOT, command, quiet_environment
 from .harness import ENV, RANDOM, last_run, scilab_rl, wait_until
@@ -52,13 +53,14 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("finished")
     done = scilab_rl("algorithm=cleansac", ENV, "n_epochs=1", "eval_after_n_steps=40",
                      "n_test_rollouts=1", "mlflow=0", "tuned=false", "save_model_freq=20",
-                     "algorithm.net_arch=[8]", "algorithm.buffer_size=200", cwd=folder)  # fmt: skip
+                     "require_updates=false", "algorithm.net_arch=[8]",
+                     "algorithm.buffer_size=200", cwd=folder)  # fmt: skip
     assert done.code == 0, done.errors
     return folder
 
 
 @pytest.fixture
-def desk(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A folder with a finished run that a test may spoil."""
     shutil.copytree(finished / "data", tmp_path / "data", symlinks=True)
     monkeypatch.chdir(tmp_path)
@@ -126,10 +128,10 @@ def with_honest_manifest(directory: Path) -> None:
 
 @pytest.mark.parametrize("name", PAYLOADS)
 def test_f30_no_pickle_is_executed(
-    name: str, desk: Path, capsys: pytest.CaptureFixture[str]
+    name: str, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    run = last_run(desk)
-    canary = desk / "canary"
+    run = last_run(project)
+    canary = project / "canary"
     for policy in ("rl_model_best", "rl_model_finished"):
         for file, content in payloads(canary)[name].items():
             (run / file.replace("rl_model_finished", policy)).write_bytes(content)
@@ -150,7 +152,7 @@ def test_f30_no_pickle_is_executed(
         ["resume", "last"],
         ["runs"],
         ["algorithm=cleansac", ENV, "n_epochs=1", "eval_after_n_steps=1", "mlflow=0",
-         "algorithm.net_arch=[8]", "n_test_rollouts=1", "tuned=false",
+         "require_updates=false", "algorithm.net_arch=[8]", "n_test_rollouts=1", "tuned=false",
          f"restore_policy={policy}"],
     ):  # fmt: skip
         code = run_command_line(arguments)
@@ -174,22 +176,43 @@ CONFIGURATIONS = {
     "object of python": ("info", "PYTHON"),
     "get_method": (
         "wrappers", [{"_target_": "hydra.utils.get_method", "path": "os.system"}]),
+    "module of the environment": ("env", "planted_canary:TinyReach-v0"),
+    "module of an environment inside": ("env_kwargs", {"inner": "planted_canary:TinyReach-v0"}),
+    "function of a network": ("algorithm", {"name": "sac", "_target_": "stable_baselines3.SAC",
+        "policy_kwargs": {"activation_fn": "planted_canary.Relu"}}),
+    "optimizer": ("algorithm", {"name": "sac", "_target_": "stable_baselines3.SAC",
+        "policy_kwargs": {"optimizer_class": {"_target_": "planted_canary.Adam"}}}),
+    "replay buffer": ("algorithm", {"name": "sac", "_target_": "stable_baselines3.SAC",
+        "replay_buffer_class": "planted_canary.Buffer"}),
+    "policy": ("algorithm", {"name": "sac", "_target_": "stable_baselines3.SAC",
+        "policy": "planted_canary.Policy"}),
+    "tracker": ("tracking", {"console": {"_target_": "planted_canary.Tracker", "enabled": True}}),
 }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", CONFIGURATIONS)
-@pytest.mark.parametrize("arguments", [("play", "last", "--episodes", "1"), ("resume", "last")])
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ("play", "last", "--episodes", "1"),
+        ("resume", "last"),
+        ("export", "last", "--episodes", "1"),
+        ("probe", "last", "--metrics", "q_value"),
+    ],
+    ids=lambda words: words[0],
+)
 def test_f31_configuration_of_a_run_is_data(
     name: str,
     arguments: tuple[str, ...],
-    desk: Path,
+    project: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     from omegaconf import OmegaConf
 
     monkeypatch.setenv("PLANTED_TOKEN", SECRET)
-    path = last_run(desk) / "config.yaml"
+    plant_canary(project, monkeypatch)
+    path = last_run(project) / "config.yaml"
     key, value = CONFIGURATIONS[name]
     cfg = OmegaConf.load(path)
     cfg[key] = value
@@ -201,11 +224,72 @@ def test_f31_configuration_of_a_run_is_data(
     captured = capsys.readouterr()
     assert re.fullmatch(r"error: .+\n", captured.err), captured.err
     assert SECRET not in captured.out + captured.err
-    assert not (desk / "canary").exists()
+    assert not (project / "canary").exists()
+    assert "config.yaml" in captured.err
+
+
+def plant_canary(project: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Put a module on Python's path that leaves a file and registers an environment."""
+    (project / "planted_canary.py").write_text(
+        "from pathlib import Path\nimport gymnasium as gym\n"
+        "Path('canary').touch()\n"
+        "gym.register('Planted-v0', 'scilab_rl.testing.environments:TinyReach', "
+        "max_episode_steps=15)\n"
+    )
+    monkeypatch.syspath_prepend(str(project))
+    monkeypatch.delitem(sys.modules, "planted_canary", raising=False)
+
+
+def test_f31_module_of_a_recorded_environment_is_confirmed_by_its_name(
+    project: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant_canary(project, monkeypatch)
+    path = last_run(project) / "config.yaml"
+    path.write_text(re.sub(r"(?m)^env: .*", "env: planted_canary:Planted-v0", path.read_text()))
+    words = ["play", "last", "--episodes", "1"]
+    assert run_command_line(words) == 2
+    assert "add --trust-module=planted_canary." in capsys.readouterr().err
+    assert run_command_line([*words, "--trust-module=another"]) == 2
+    assert run_command_line([*words, "--trust-module"]) == 2
+    assert not (project / "canary").exists()
+    assert run_command_line([*words, "--trust-module=planted_canary"]) == 0
+    assert (project / "canary").exists()
+    monkeypatch.delitem(sys.modules, "planted_canary")
+    assert run_command_line(words) == 2  # trust is for one command
+
+
+def test_f31_modules_of_the_project_folder_and_of_plug_ins_need_no_confirmation(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from importlib import metadata
+
+    from scilab_rl.config.recorded import refuse_untrusted_modules
+
+    plug_in = metadata.EntryPoint("__root__", "my_plug_in.envs:register", "gymnasium.envs")
+    monkeypatch.setattr(metadata, "entry_points", lambda group: [plug_in])
+    for module in ("custom_envs", "custom_envs.mine", "my_plug_in.envs", "scilab_rl.testing"):
+        refuse_untrusted_modules({"env": f"{module}:Id-v0"}, project)
+    typed = "typed_by_the_user:Id-v0"
+    refuse_untrusted_modules({"env": typed}, project, typed_env=typed)
+
+
+def test_f31_recorded_places_are_not_written_to(project: Path, tmp_path: Path) -> None:
+    """A resumed run stays where it lies, and its view on this machine."""
+    from scilab_rl.config.recorded import load_recorded
+
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    path = last_run(project) / "config.yaml"
+    text = re.sub(r"(?m)^base_logdir: .*", f"base_logdir: {elsewhere}", path.read_text())
+    path.write_text(re.sub(r"(?m)^viewer_host: .*", "viewer_host: 0.0.0.0", text))
+    assert load_recorded(path).viewer_host == "127.0.0.1"
+    assert load_recorded(path, ["viewer_host=0.0.0.0"]).viewer_host == "0.0.0.0"
+    assert run_command_line(["resume", "last", "n_epochs=2"]) == 0
+    assert list(elsewhere.iterdir()) == []
 
 
 def test_f31_what_the_user_types_is_his_own_choice(
-    desk: Path, capsys: pytest.CaptureFixture[str]
+    project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = run_command_line(["algorithm._target_=os.system", ENV, "mlflow=0"])
     assert code == 2  # it is no class, so it is not called
@@ -256,7 +340,7 @@ def give_names(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    folder = tmp_path / "deep" / "desk"
+    folder = tmp_path / "deep" / "project"
     folder.mkdir(parents=True)
     monkeypatch.chdir(folder)
     for name in names:
@@ -271,7 +355,7 @@ def give_names(
 def test_f32_hostile_runs_to_look_at(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = tmp_path / "desk"
+    folder = tmp_path / "project"
     folder.mkdir()
     monkeypatch.chdir(folder)
     for words in (["play", "--", name], ["resume", "--", name], ["view", "--", name]):
@@ -283,37 +367,37 @@ def test_f32_hostile_runs_to_look_at(
     assert list(folder.iterdir()) == []
 
 
-def test_f32_linked_run_is_not_listed_twice_and_not_cleaned(desk: Path) -> None:
-    run = last_run(desk)
+def test_f32_linked_run_is_not_listed_twice_and_not_cleaned(project: Path) -> None:
+    run = last_run(project)
     (run.parent / "link").symlink_to("/etc")
-    (desk / "data" / "2020-01-01").symlink_to(run.parent)
-    listed = scilab_rl("runs", "--json", cwd=desk)
+    (project / "data" / "2020-01-01").symlink_to(run.parent)
+    listed = scilab_rl("runs", "--json", cwd=project)
     assert len(json.loads(listed.output)) == 1
-    assert "/etc" not in scilab_rl("clean", cwd=desk).output
+    assert "/etc" not in scilab_rl("clean", cwd=project).output
 
 
 @pytest.mark.parametrize("member", ["../outside", "/tmp/outside-of-all", "a/../../outside"])
 def test_f32_archives_are_never_unpacked(
-    member: str, desk: Path, capsys: pytest.CaptureFixture[str]
+    member: str, project: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A zip of Stable-Baselines3 is read member by member, by names of ours."""
-    path = zip_of(desk / "model.zip", {member: b"x", "data": b"{}", "policy.pth": b"x"})
+    path = zip_of(project / "model.zip", {member: b"x", "data": b"{}", "policy.pth": b"x"})
     code = run_command_line(
         ["play", str(path), "algorithm=sac", ENV, "--episodes", "1", "--trust-pickle"]
     )
     assert code in (1, 2)
     assert "Traceback" not in capsys.readouterr().err
-    assert not list(desk.rglob("outside*"))
-    assert not list(desk.parent.glob("outside*"))
+    assert not list(project.rglob("outside*"))
+    assert not list(project.parent.glob("outside*"))
     assert not Path("/tmp/outside-of-all").exists()
 
 
-def test_f32_manifest_that_names_files_elsewhere(desk: Path) -> None:
+def test_f32_manifest_that_names_files_elsewhere(project: Path) -> None:
     """Checksums of somebody's files must not be compared for an attacker."""
     from scilab_rl.errors import CheckpointError
     from scilab_rl.training import checkpoint
 
-    directory = last_run(desk) / "rl_model_finished"
+    directory = last_run(project) / "rl_model_finished"
     manifest = json.loads((directory / "manifest.json").read_text())
     for name in ("/etc/passwd", "../config.yaml", "arrays/../../config.yaml"):
         changed = manifest | {"files": manifest["files"] | {name: {"bytes": 1, "sha256": "x"}}}
@@ -435,8 +519,8 @@ def test_f35_errors_are_masked_too(tmp_path: Path) -> None:
     ],
 )  # fmt: skip
 def test_f35_what_is_masked_and_what_is_not(text: str, masked: str) -> None:
-    assert mask(text) == masked
-    assert mask(masked) == masked
+    assert redact(text) == masked
+    assert redact(masked) == masked
 
 
 def test_f35_changed_code_is_kept_without_its_secrets(tmp_path: Path) -> None:
@@ -470,7 +554,7 @@ def test_f35_changed_code_is_kept_without_its_secrets(tmp_path: Path) -> None:
 def test_f35_values_of_variables(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("GITHUB_TOKEN", "ghp_0123456789")
     monkeypatch.setenv("SHORT_TOKEN", "data")  # an ordinary word
-    assert mask("with ghp_0123456789 in data") == "with *** in data"
+    assert redact("with ghp_0123456789 in data") == "with *** in data"
 
 
 def test_f31_secrets_of_the_environment_are_not_written(tmp_path: Path) -> None:
@@ -493,7 +577,7 @@ def test_f30_find_run_never_opens_what_it_finds(tmp_path: Path) -> None:
 
 def test_no_pickle_is_read_in_the_package() -> None:
     """The words that read a pickle occur where they are explained, and nowhere else."""
-    allowed = {"envs/examination.py", "algorithms/goal_functions.py"}  # their own, of a moment ago
+    allowed = {"envs/checker.py", "learning/goal_functions.py"}  # their own, of a moment ago
     reading = re.compile(r"pickle\.loads?\(|torch\.load\(|joblib\.load|allow_pickle=True")
     found = {
         str(path.relative_to(ROOT / "src" / "scilab_rl"))
@@ -525,10 +609,14 @@ def viewing(folder: Path) -> Iterator[tuple[subprocess.Popen, int]]:
 
 
 @contextmanager
-def started(*arguments: str, cwd: Path, program: tuple[str, ...] = ()) -> Iterator[Any]:
+def started(
+    *arguments: str, cwd: Path, program: tuple[str, ...] = (), **variables: str
+) -> Iterator[Any]:
     """Run a command line beside the test, without a display; yields it, and where it writes."""
     said = cwd / "said"
-    environment = quiet_environment(PYTHONPATH=str(ROOT), DISPLAY="", WAYLAND_DISPLAY="")
+    environment = quiet_environment(
+        PYTHONPATH=str(ROOT), DISPLAY="", WAYLAND_DISPLAY="", **variables
+    )
     with said.open("wb") as file:
         process = subprocess.Popen(
             [*program, *arguments] if program else command(*arguments),
@@ -704,11 +792,48 @@ def mlflow_ui(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[subpro
     arguments = re.sub(r"--port \d+", f"--port {port} --workers 1", told).split()
     folder = tmp_path_factory.mktemp("mlflow")
     (folder / "data").mkdir()
-    with started(*arguments, cwd=folder, program=(sys.executable, "-m", "mlflow")) as (process, _):
+    (folder / "home").mkdir()
+    variables = exported_by_make() | {"HOME": str(folder / "home")}
+    program = (sys.executable, "-m", "mlflow")
+    with started(*arguments, cwd=folder, program=program, **variables) as (process, _):
         wait_until(
             lambda: port in (number for _, number in listeners_of(tree_of(process.pid))), 120
         )
         yield process, port
+
+
+def exported_by_make() -> dict[str, str]:
+    """Return the variables that `make` gives to the programs of its targets."""
+    told = subprocess.run(
+        ["make", "--silent", "--eval", "show-variables: ; @env", "show-variables"],
+        cwd=ROOT, capture_output=True, text=True, check=True,
+    ).stdout  # fmt: skip
+    words = dict(line.partition("=")[::2] for line in told.splitlines())
+    return {name: words[name] for name in SWITCHES if name in words and name not in os.environ}
+
+
+def test_f33_make_and_the_command_line_switch_telemetry_off(
+    project: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in SWITCHES:
+        monkeypatch.delenv(name, raising=False)
+    assert exported_by_make() == {
+        name: SWITCHES[name] for name in ("DO_NOT_TRACK", "MLFLOW_DISABLE_TELEMETRY")
+    }
+    monkeypatch.setenv("DO_NOT_TRACK", "false")  # somebody's own wish
+    assert run_command_line(["runs"]) == 0
+    assert {name: os.environ.get(name) for name in SWITCHES} == SWITCHES | {"DO_NOT_TRACK": "false"}
+    for name in SWITCHES:
+        monkeypatch.delenv(name)
+
+
+@pytest.mark.slow
+def test_f33_mlflow_ui_leaves_nothing_in_the_home_folder(mlflow_ui: Any) -> None:
+    """Its telemetry begins with a number for this installation, in ``~/.config/mlflow``."""
+    process, _ = mlflow_ui
+    words = Path(f"/proc/{process.pid}/environ").read_bytes().split(b"\0")
+    (home,) = (Path(word[5:].decode()) for word in words if word.startswith(b"HOME="))
+    assert [path for path in home.rglob("*") if path.is_file()] == []
 
 
 @pytest.mark.slow

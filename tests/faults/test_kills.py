@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 
 from scilab_rl.training import checkpoint
-from scilab_rl.training.interruption import polite_stop
+from scilab_rl.training.interruption import graceful_shutdown
 
 from ..e2e.commands import ROOT, command, quiet_environment
 from .harness import ENV, Process, content, last_run, result_of, runs_in, scilab_rl, wait_until
@@ -231,7 +231,7 @@ def test_f03_asked_twice_it_ends_at_once(tmp_path: Path) -> None:
 
 def test_f03_handlers_are_given_back_and_only_the_main_thread_has_any() -> None:
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    with polite_stop() as request:
+    with graceful_shutdown() as request:
         assert [signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)] != before
         os.kill(os.getpid(), signal.SIGTERM)
         assert request.signal_number == signal.SIGTERM
@@ -240,7 +240,7 @@ def test_f03_handlers_are_given_back_and_only_the_main_thread_has_any() -> None:
     seen = []
 
     def elsewhere() -> None:
-        with polite_stop():
+        with graceful_shutdown():
             seen.append([signal.getsignal(n) for n in (signal.SIGINT, signal.SIGTERM)])
 
     thread = threading.Thread(target=elsewhere)

@@ -16,11 +16,13 @@ from pathlib import Path
 
 import pytest
 
-from scilab_rl.hyperopt.ledger import Ledger
-from scilab_rl.hyperopt.runs import COMPLETE, LOST, RUNNING
+from scilab_rl.config.schema import RunConfig
 from scilab_rl.metrics.logger import MetricLogger
-from scilab_rl.results import RunResult, read_epochs
-from scilab_rl.tracking.base import RunInfo
+from scilab_rl.results import RunResult
+from scilab_rl.run.directory import read_epochs
+from scilab_rl.search.runs import COMPLETE, LOST, RUNNING
+from scilab_rl.search.storage import StudyStorage
+from scilab_rl.tracking.base import TrackedRun
 from scilab_rl.tracking.files import FilesTracker
 
 from .harness import RANDOM, last_run, result_of, scilab_rl
@@ -51,7 +53,7 @@ def test_f16_two_hundred_runs_while_workers_and_parents_are_killed(tmp_path: Pat
             process = start(study)
     output, errors = process.communicate()
     assert (process.returncode, output) == (0, "finished\n"), errors
-    runs = Ledger(study).runs()
+    runs = StudyStorage(study).runs()
     searched = [run for run in runs if not run.is_final]
     assert len(searched) == N_TRIALS
     assert len({(run.trial, run.repeat) for run in runs}) == len(runs) == N_TRIALS + 1
@@ -64,7 +66,7 @@ def test_f16_two_hundred_runs_while_workers_and_parents_are_killed(tmp_path: Pat
 
 
 def start(study: Path) -> subprocess.Popen:
-    words = [sys.executable, "-m", "tests.unit.hyperopt.toy", str(study), str(N_TRIALS), "2", ""]
+    words = [sys.executable, "-m", "tests.unit.search.toy", str(study), str(N_TRIALS), "2", ""]
     return subprocess.Popen(
         words, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -74,7 +76,7 @@ def n_done(study: Path) -> int:
     if not study.exists():
         return 0
     try:
-        return sum(run.state != RUNNING for run in Ledger(study).runs())
+        return sum(run.state != RUNNING for run in StudyStorage(study).runs())
     except Exception:  # noqa: BLE001 - the database is just being made
         return 0
 
@@ -103,7 +105,7 @@ def test_ten_thousand_values_per_second(tmp_path: Path) -> None:
         logger.record("train/x", index)
     assert time.thread_time() - started < 2.0
     tracker = FilesTracker()
-    tracker.begin(RunInfo(tmp_path, tmp_path, "Env", "algorithm", 1, 1, 1))
+    tracker.begin(TrackedRun(RunConfig(), tmp_path))
     values = {f"train/{index}": index / 7 for index in range(50)}
     started = time.thread_time()
     for epoch in range(200):
@@ -153,7 +155,7 @@ def test_runs_at_the_same_time_on_one_mlflow_database(tmp_path: Path) -> None:
 
 
 def test_a_cut_line_never_hides_the_others(tmp_path: Path) -> None:
-    from scilab_rl.results import RunDirectory
+    from scilab_rl.run.directory import RunDirectory
 
     lines = [f'{{"kind": "epoch", "epoch": {n}, "step": {n}}}\n' for n in range(1, 4)]
     whole = "".join(lines)

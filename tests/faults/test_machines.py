@@ -6,7 +6,6 @@ import json
 import os
 import pty
 import re
-import runpy
 import shutil
 import subprocess
 import sys
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from scilab_rl.results import RunDirectory
+from scilab_rl.run.directory import RunDirectory
 
 from ..e2e.commands import ROOT, command, quiet_environment
 from .harness import RANDOM, last_run, result_of, runs_in, scilab_rl
@@ -23,7 +22,7 @@ from .harness import RANDOM, last_run, result_of, runs_in, scilab_rl
 
 def test_f36_fifty_starts_in_the_same_second(tmp_path: Path) -> None:
     script = (
-        "import sys; from pathlib import Path; from scilab_rl.results import RunDirectory\n"
+        "import sys; from pathlib import Path; from scilab_rl.run.directory import RunDirectory\n"
         "for _ in range(25): print(RunDirectory.create(Path(sys.argv[1]), 'E', 'a', 1))"
     )
     processes = [
@@ -42,7 +41,7 @@ def test_f37_clock_that_jumps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
     with monkeypatch.context() as patch:
         patch.setattr(time, "time", lambda: now + next(jumps))
         patch.chdir(tmp_path)
-        from scilab_rl.cli import run_command_line
+        from scilab_rl.cli.main import run_command_line
 
         assert run_command_line(list(RANDOM)) == 0
     result = result_of(last_run(tmp_path))
@@ -246,18 +245,27 @@ def test_f36_run_directories_are_made_by_mkdir_alone(tmp_path: Path) -> None:
         first.path.mkdir()
 
 
-def test_no_pin_is_known_as_vulnerable() -> None:
-    """Of our own list; `make audit` asks pip-audit, too."""
-    audit = runpy.run_path(str(ROOT / "scripts" / "audit.py"))
-    pinned = audit["pins"](ROOT / "constraints.txt")
-    problems, n_compared, n_checked = audit["known_problems"](pinned)
-    assert problems == []
-    assert n_compared >= n_checked >= 90
-    old = {"torch": audit["Version"]("2.5.1"), "opencv-python": audit["Version"]("4.8.0.76")}
-    problems, n_compared, n_checked = audit["known_problems"](old)
-    assert len(problems) == n_compared == 6
-    assert n_checked == 5
-    assert "CVE-2025-32434" in problems[0]
+@pytest.mark.parametrize(
+    ("answer", "report"),
+    [
+        ("raise SystemExit('no network')", r"Nothing was audited: .*\n"),
+        ("print(answer(skip_reason='not found'))", r"Nothing was audited: .*\n"),
+        ("print(answer(vulns=[]))", r"1 of \d\d\d pinned packages .*\n"),
+        ("print(answer(vulns=[{'id': 'CVE-1'}]))", r"1 of \d\d\d .*\nx 1 has CVE-1\n"),
+    ],
+)
+def test_audit_reports_and_never_decides(answer: str, report: str, tmp_path: Path) -> None:
+    (tmp_path / "pip_audit.py").write_text(
+        "import json\ndef answer(**more):\n"
+        "    return json.dumps({'dependencies': [{'name': 'x', 'version': '1', **more}]})\n"
+        + answer
+    )
+    done = subprocess.run(
+        [sys.executable, str(ROOT / "scripts" / "audit.py")],
+        env={"PYTHONPATH": str(tmp_path)}, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (0, "")
+    assert re.fullmatch(report, done.stdout)
 
 
 GOLDEN = Path(__file__).parent / "golden"

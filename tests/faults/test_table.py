@@ -44,7 +44,9 @@ def test_row_names_the_tests_that_exist(number: str) -> None:
 
 
 def test_exit_codes_are_those_of_the_code() -> None:
-    from scilab_rl import cli, errors, results
+    from scilab_rl import errors
+    from scilab_rl.cli import main as cli
+    from scilab_rl.results import EXIT_REQUEUE
 
     text = DOCUMENT.read_text(encoding="utf-8")
     stated = {int(code) for code in re.findall(r"^\| (\d+) \|", text, re.MULTILINE)}
@@ -53,7 +55,7 @@ def test_exit_codes_are_those_of_the_code() -> None:
         errors.ScilabRLError.exit_code,
         errors.ConfigError.exit_code,
         errors.SomeRunsFailedError.exit_code,
-        results.EXIT_REQUEUE,
+        EXIT_REQUEUE,
         cli.EXIT_INTERRUPTED,
         cli.EXIT_PIPE_CLOSED,
         143,

@@ -14,9 +14,11 @@ from typing import Any
 
 import pytest
 
-from scilab_rl.results import RunDirectory, RunResult, read_epochs
-from scilab_rl.tracking.base import RunInfo, Tracker
-from scilab_rl.tracking.mirror import Mirror
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.results import RunResult
+from scilab_rl.run.directory import RunDirectory, read_epochs
+from scilab_rl.tracking.background import BackgroundTracker
+from scilab_rl.tracking.base import TrackedRun, Tracker
 
 from .environment import ID
 from .harness import RANDOM, allows_namespaces, content, last_run, result_of, scilab_rl
@@ -69,8 +71,8 @@ class Posting(Tracker):
             answer.read()
 
 
-def run_info(folder: Path) -> RunInfo:
-    return RunInfo(folder, folder, "Env", "algorithm", 1, 100, 10)
+def run_info(folder: Path) -> TrackedRun:
+    return TrackedRun(RunConfig("Env", base_logdir=str(folder)), folder)
 
 
 RESULT = RunResult("finished", 1.0, 1, 1, 1.0, "run")
@@ -83,7 +85,7 @@ def test_f22_server_that_fails_in_the_middle_costs_no_time(
     caplog.set_level(logging.WARNING)
     server = Server()
     with server.running() as address:
-        mirror = Mirror(Posting(address), "stub", queue_size=50, patience_seconds=2)
+        mirror = BackgroundTracker(Posting(address), "stub", queue_size=50, patience_seconds=2)
         mirror.begin(run_info(tmp_path))
         mirror.epoch(1, 1, {})
         deadline = time.monotonic() + 10
@@ -143,14 +145,15 @@ def test_f21_what_a_server_has_missed_is_sent_later(tmp_path: Path) -> None:
     assert still_away.code == 1
     assert "the same command sends the rest" in still_away.error
     there = f"sqlite:///{tmp_path / 'there.db'}"
-    for said in ("values and 0 files sent", "complete there already"):
+    for said in ("values and 0 files sent", "already complete"):
         done = scilab_rl("sync", "last", "--uri", there, cwd=tmp_path)
         assert done.code == 0, done.errors
         assert f"{run.name}: " in done.errors
         assert said in done.errors
     client = mlflow.MlflowClient(there)
     (found,) = client.search_runs([e.experiment_id for e in client.search_experiments()])
-    assert (found.info.run_name, found.info.status) == (run.name, "FINISHED")
+    assert found.info.run_name.endswith(f" {run.name}")
+    assert found.info.status == "FINISHED"
     assert found.data.params["env"] == ID
     rows = read_epochs(RunDirectory(run))
     assert len(rows) == 3

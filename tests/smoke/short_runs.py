@@ -8,20 +8,23 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import hydra
 import pytest
 from gymnasium.envs.registration import load_env_creator
 from omegaconf import OmegaConf
 
-from scilab_rl import assembly, config, experiment
-from scilab_rl.algorithms.compatibility import check_pair
+from scilab_rl.acceptance.conditions import performance_tests
+from scilab_rl.config import compose as composition
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.config.workspace import config_files, open_project
 from scilab_rl.envs.ids import FAMILIES
 from scilab_rl.envs.registration import module_of, resolve_env_id
-from scilab_rl.envs.vectorize import EnvSettings, make_single_env
+from scilab_rl.envs.vectorize import make_single_env
 from scilab_rl.errors import ConfigError, MissingDependencyError
-from scilab_rl.performance.conditions import performance_tests
-from scilab_rl.results import RunDirectory, RunResult
-from scilab_rl.workspace import config_files, open_desk
+from scilab_rl.learning.compatibility import check_pair
+from scilab_rl.results import RunResult
+from scilab_rl.run.checks import algorithm_class, complete
+from scilab_rl.run.directory import RunDirectory
+from scilab_rl.run.run import start_run
 
 SHORT = (
     "eval_after_n_steps=40",
@@ -46,14 +49,14 @@ _LIMITS = {
 
 
 def algorithms() -> list[str]:
-    """Return every algorithm that has a YAML, of the framework and of the desk."""
+    """Return every algorithm that has a YAML, of the framework and of the project folder."""
     return sorted(config_files("algorithm"))
 
 
 def environments() -> list[str]:
-    """Return every environment that is shipped, on the desk, or named in a YAML file."""
+    """Return every environment that is shipped, in the project folder, or named in a YAML file."""
     before = set(gym.registry)
-    open_desk()
+    open_project()
     found = {family.env_id for family in FAMILIES}
     found |= {i for i in set(gym.registry) - before if module_of(gym.spec(i)).startswith("custom_")}
     for group in ("performance", "search", "tuned_values"):
@@ -73,9 +76,9 @@ def missing_packages_skip() -> Iterator[None]:
 
 def compose(*overrides: str) -> Any:
     """Compose a configuration with small values for what its algorithm has."""
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"), \
-         missing_packages_skip():  # fmt: skip
-        algorithm = config.compose(overrides).algorithm
+    with missing_packages_skip():
+        cfg = composition.compose(overrides)
+        algorithm = cfg.algorithm.arguments
         small = [
             f"++algorithm.{key}={min(limit, algorithm[key])}"
             for key, limit in _LIMITS.items()
@@ -84,22 +87,23 @@ def compose(*overrides: str) -> Any:
             # Stable-Baselines3's off-policy n_steps is the length of returns, not of rollouts.
             and not (key == "n_steps" and algorithm[key] < limit)
         ]
-        return config.compose([*overrides, *small])
+        # Few steps reach the first update only where few environments share them.
+        return composition.compose([*overrides, *small, f"n_envs={min(2, cfg.n_envs)}"])
 
 
 def train(base: Path, *overrides: str) -> RunResult:
     """Train in this process: imports are paid once for all runs."""
     cfg = compose(*SHORT, f"base_logdir={base}", *overrides)
     with missing_packages_skip():
-        return experiment.run(cfg, list(overrides))
+        return start_run(cfg, list(overrides))
 
 
 def finished_well(result: RunResult, *, n_steps: int = 40) -> bool:
-    """Tell whether a run has ended as it should and has left its files."""
+    """Return whether a run has ended as it should and has left its files."""
     run = RunDirectory(Path(result.run_dir))
     files = ("config.yaml", "metrics.csv", "provenance.json", "rl_model_finished/manifest.json")
     return (
-        result.status in ("finished", "stopped_early")
+        result.status in ("finished", "solved")
         and result.steps >= n_steps
         and "eval/mean_reward" in result.metrics
         and all((run / name).is_file() for name in files)
@@ -110,10 +114,10 @@ def fitting_algorithm(env_id: str, *overrides: str) -> str:
     """Return the first one-file algorithm whose spaces fit an environment."""
     cfg = compose(f"env={env_id}", *overrides)
     with missing_packages_skip():
-        cfg = assembly.complete(cfg)
-        env = make_single_env(assembly.env_settings(cfg))
+        cfg = complete(cfg)
+        env = make_single_env(cfg)
     for name in ("cleansac", "cleandqn", "cleanppo"):
-        cls = assembly.algorithm_class(compose(f"algorithm={name}"))
+        cls = algorithm_class(compose(f"algorithm={name}"))
         with contextlib.suppress(ConfigError):
             check_pair(name, cls, cfg.env, env)
             env.close()
@@ -122,7 +126,7 @@ def fitting_algorithm(env_id: str, *overrides: str) -> str:
 
 
 def can_draw(env_id: str) -> bool:
-    """Tell whether an environment says that it has frames; those of tests may have none."""
+    """Return whether an environment says that it has frames; those of tests may have none."""
     target = gym.spec(resolve_env_id(env_id)[0].rpartition(":")[2]).entry_point
     made = load_env_creator(target) if isinstance(target, str) else target
     return "rgb_array" in getattr(made, "metadata", {"render_modes": ["rgb_array"]})["render_modes"]
@@ -131,11 +135,11 @@ def can_draw(env_id: str) -> bool:
 def fitting_environment(algorithm: str) -> str:
     """Return the first tiny environment whose spaces fit an algorithm."""
     with missing_packages_skip():
-        cls = assembly.algorithm_class(compose(f"algorithm={algorithm}"))
+        cls = algorithm_class(compose(f"algorithm={algorithm}"))
     names = ("TinyReach", "TinyReachDiscrete", "TinyBox", "TinyDiscrete")
     for env_id in (f"scilab_rl.testing:{name}-v0" for name in names):
         with contextlib.suppress(ConfigError):
-            check_pair(algorithm, cls, env_id, make_single_env(EnvSettings(env_id)))
+            check_pair(algorithm, cls, env_id, make_single_env(RunConfig(env_id)))
             return env_id
     raise AssertionError(f"no tiny environment fits {algorithm}")
 

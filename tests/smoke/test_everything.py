@@ -10,16 +10,18 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-import hydra
 import pytest
 from omegaconf import OmegaConf
 
-from scilab_rl import config, experiment
-from scilab_rl.hyperopt.space import SearchSpace, parse_space
-from scilab_rl.performance.campaign import read_test
-from scilab_rl.results import CONFIG_FILE, RunDirectory
-from scilab_rl.visualization.archive import FOLDER
-from scilab_rl.workspace import config_files
+from scilab_rl.acceptance.runner import read_test
+from scilab_rl.config.recorded import load_recorded
+from scilab_rl.config.workspace import config_files
+from scilab_rl.recording.records import FOLDER
+from scilab_rl.run.directory import CONFIG_FILE, RunDirectory
+from scilab_rl.run.player import measure_run
+from scilab_rl.run.run import resume_run
+from scilab_rl.search.parsing import parse_space
+from scilab_rl.search.space import SearchSpace
 from tests.smoke.short_runs import (
     EPISODE,
     algorithms,
@@ -41,7 +43,7 @@ pytestmark = [
 ]
 TESTS, SEARCHES = names_of_tests_and_searches()
 _SHORTER = (
-    "eval_after_n_steps=40",
+    "eval_after_n_steps=80",  # an update comes after one episode of each environment
     "n_epochs=1",
     "n_test_rollouts=1",
     "vector=inprocess",
@@ -80,14 +82,12 @@ def test_algorithm_trains_saves_loads_and_resumes(algorithm: str, tmp_path: Path
     # Loading: another run starts from the policy.
     second = train(tmp_path, *told, f"restore_policy={first.run_dir}/rl_model_finished")
     assert finished_well(second)
-    assert (experiment.measure(RunDirectory(Path(second.run_dir)), 1)).keys() >= {
-        "eval/mean_reward"
-    }
+    assert (measure_run(RunDirectory(Path(second.run_dir)), 1)).keys() >= {"eval/mean_reward"}
 
     # Resuming: the first run goes on where its checkpoint was.
     run = RunDirectory(Path(first.run_dir))
-    cfg = config.load_recorded(run / CONFIG_FILE, ["n_epochs=2"])
-    resumed = experiment.resume(cfg, run)
+    cfg = load_recorded(run / CONFIG_FILE, ["n_epochs=2"])
+    resumed = resume_run(cfg, run)
     assert finished_well(resumed, n_steps=80)
     assert resumed.epochs == 2
 
@@ -110,8 +110,7 @@ def test_environment_trains_and_is_recorded(
 @pytest.mark.parametrize("name", TESTS)
 def test_performance_test_composes_and_starts(name: str, tmp_path: Path) -> None:
     """With its own networks and values, but few steps and a short episode."""
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"), \
-         missing_packages_skip():  # fmt: skip
+    with missing_packages_skip():
         test = read_test(name, [f"+performance={name}"])
     assert test.conditions.make_rule().max_runs >= 2
     result = train(tmp_path, *test.overrides, *_SHORTER)

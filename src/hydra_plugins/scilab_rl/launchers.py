@@ -1,12 +1,28 @@
-"""Lets Hydra find our launchers; what they do is in `scilab_rl.hyperopt`."""
+"""Lets Hydra find our launchers; what they do is in `scilab_rl.parallel`."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
-from typing import Any
+from pathlib import Path
 
 from hydra._internal.core_plugins.basic_launcher import BasicLauncher
 from hydra.core.utils import JobReturn, JobStatus
+
+_log = logging.getLogger("scilab_rl")
+
+
+class LocalLauncher(BasicLauncher):
+    """Trains here, also where a file has the keys of another launcher.
+
+    Args:
+        settings: The mapping ``hydra.launcher``.
+    """
+
+    def __init__(self, **settings: object) -> None:
+        super().__init__()
+        if ignored := [key for key in settings if key != "kind"]:
+            _log.info("hydra/launcher=local trains here and ignores %s.", ", ".join(ignored))
 
 
 class JobLauncher(BasicLauncher):
@@ -16,7 +32,7 @@ class JobLauncher(BasicLauncher):
         settings: The mapping ``hydra.launcher``.
     """
 
-    def __init__(self, **settings: Any) -> None:
+    def __init__(self, **settings: object) -> None:
         super().__init__()
         self.settings = settings
 
@@ -24,9 +40,10 @@ class JobLauncher(BasicLauncher):
         self, job_overrides: Sequence[Sequence[str]], initial_job_idx: int
     ) -> Sequence[JobReturn]:
         """Train the runs of a grid, each one once."""
-        from scilab_rl.hyperopt import grid
+        from scilab_rl.parallel import grid
 
         assert self.config is not None
-        target = self.config.hydra.launcher._target_
-        grid.run({"_target_": target, **self.settings}, job_overrides, self.config)
+        hydra = self.config.hydra
+        launcher = {"_target_": hydra.launcher._target_, **self.settings}
+        grid.run(launcher, job_overrides, hydra.sweeper.n_jobs, Path(hydra.sweep.dir))
         return [JobReturn(_return_value=None, status=JobStatus.COMPLETED) for _ in job_overrides]

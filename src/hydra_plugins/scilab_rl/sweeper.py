@@ -21,9 +21,9 @@ class StudySweeper(BasicSweeper):
 
     def sweep(self, arguments: list[str]) -> Any:
         """Run all trials."""
-        from scilab_rl.config import CONDITIONS
-        from scilab_rl.hyperopt import sweep
-        from scilab_rl.performance import session
+        from scilab_rl.acceptance import session
+        from scilab_rl.config.schema import CONDITIONS
+        from scilab_rl.search import parsing, sweep
 
         assert self.config is not None and self.hydra_context is not None
         sweeper = OmegaConf.to_container(self.config.hydra.sweeper, resolve=True)
@@ -35,4 +35,5 @@ class StudySweeper(BasicSweeper):
             return session.run_from_sweep(sweeper, launcher, overrides)
         if sweep.is_study(sweeper, overrides):
             return sweep.run_study(sweeper, launcher, overrides)
+        parsing.refuse_endless_grid(overrides)
         return super().sweep(arguments)

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation (PPO) in one file, for continuous and discrete actions.
+"""Proximal policy optimization (PPO) in one file, for continuous and discrete actions.
 
 Schulman et al., 2017, "Proximal Policy Optimization Algorithms", arXiv 1707.06347. The agent plays
 ``n_steps`` in each environment, then improves its policy on exactly these steps and forgets them:
@@ -8,17 +8,13 @@ Schulman et al., 2017, "Proximal Policy Optimization Algorithms", arXiv 1707.063
     policy     L_clip = E[min(rho_t A_t, clip(rho_t, 1 - eps, 1 + eps) A_t)]             (eq. 7)
                rho_t = pi(a_t|s_t) / pi_old(a_t|s_t)
     value      L_vf = E[(V(s_t) - R_t)^2],  R_t = A_t + V(s_t)
-    together   minimise -L_clip + c_1 L_vf - c_2 H(pi)                                   (eq. 9)
+    together   minimize -L_clip + c_1 L_vf - c_2 H(pi)                                   (eq. 9)
 
 V(s_{t+1}) is the value of the state that the step really led to. An episode that was cut off
 (truncated) therefore counts with the value of its last state, and one that terminated with nothing.
 
-What differs from the paper: advantages are normalised per minibatch, gradients are clipped, and
+What differs from the paper: advantages are normalized per minibatch, gradients are clipped, and
 ``target_kl`` may end the epochs early, as in most implementations.
-
-Metrics: train/policy_loss, train/value_loss, train/entropy, train/approx_kl, train/clip_fraction,
-train/explained_variance, train/n_updates, and per environment step train/rollout_value_step,
-train/rollout_logpi_step.
 """
 
 from __future__ import annotations
@@ -27,7 +23,7 @@ import itertools
 import math
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -37,8 +33,11 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.distributions import Categorical, Distribution, Independent, Normal
 
-from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm, Step
 from scilab_rl.algorithms.intrinsic.build import make_intrinsic_reward
+from scilab_rl.envs.types import Observation
+from scilab_rl.envs.vec_step import VecStep
+from scilab_rl.learning.base import LazyNumber, OneFileAlgorithm
+from scilab_rl.learning.nn import gradient_step
 
 
 class ActorCritic(nn.Module):
@@ -78,7 +77,7 @@ class ActorCritic(nn.Module):
 
 
 class Rollout(NamedTuple):
-    """What was experienced since the last update, all environments one after the other.
+    """The experience since the last update, of all environments one after the other.
 
     Shapes:
         observations: ``(n_steps * n_envs, n_observations)``; actions: ``(n_steps * n_envs, ...)``;
@@ -94,7 +93,7 @@ class Rollout(NamedTuple):
 
 
 class CLEANPPO(OneFileAlgorithm):
-    """Proximal policy optimisation.
+    """Proximal policy optimization.
 
     Args:
         env: Vector environment with continuous or discrete actions.
@@ -117,6 +116,17 @@ class CLEANPPO(OneFileAlgorithm):
     """
 
     supported_action_spaces = (spaces.Box, spaces.Discrete)
+    metrics = (
+        "train/policy_loss",
+        "train/value_loss",
+        "train/entropy",
+        "train/approx_kl",
+        "train/clip_fraction",
+        "train/explained_variance",
+        "train/n_updates",
+        "train/rollout_value_step",
+        "train/rollout_logpi_step",
+    )
 
     def __init__(
         self,
@@ -135,7 +145,7 @@ class CLEANPPO(OneFileAlgorithm):
         max_grad_norm: float = 0.5,
         target_kl: float | None = None,
         net_arch: Sequence[int] = (64, 64),
-        intrinsic: str | Mapping[str, Any] | None = None,
+        intrinsic: str | Mapping[str, object] | None = None,
         seed: int | None = None,
         device: str = "auto",
     ) -> None:
@@ -169,9 +179,9 @@ class CLEANPPO(OneFileAlgorithm):
         return True
 
     def collect(self, callback: BaseCallback) -> Rollout | None:
-        """Play ``n_steps`` in each environment; return None when the callback wants to stop."""
+        """Play ``n_steps`` in each environment; return None if the callback stops."""
         callback.on_rollout_start()
-        steps: list[Step] = []
+        steps: list[VecStep] = []
         actions: list[Tensor] = []
         for _ in range(self.n_steps):
             with torch.no_grad():
@@ -192,7 +202,7 @@ class CLEANPPO(OneFileAlgorithm):
         return policy.mode if deterministic else policy.sample()
 
     @torch.no_grad()
-    def make_rollout(self, steps: Sequence[Step], actions: Tensor) -> Rollout:
+    def make_rollout(self, steps: Sequence[VecStep], actions: Tensor) -> Rollout:
         """Compute advantages and returns of consecutive steps.
 
         Shapes:
@@ -252,10 +262,7 @@ class CLEANPPO(OneFileAlgorithm):
         entropy = policy.entropy().mean()
         loss = policy_loss + self.vf_coef * value_loss - self.ent_coef * entropy
 
-        self.optimizer.zero_grad()
-        loss.backward()
-        nn.utils.clip_grad_norm_(self.networks.parameters(), self.max_grad_norm)
-        self.optimizer.step()
+        gradient_step(self.optimizer, loss, self.max_grad_norm)
         self.n_updates += 1
 
         is_clipped = (log_ratio.detach().exp() - 1).abs() > self.clip_range
@@ -265,7 +272,7 @@ class CLEANPPO(OneFileAlgorithm):
         records["clip_fraction"].append(is_clipped.float().mean())
         return True
 
-    def _stacked(self, steps: Sequence[Step], name: str) -> Tensor:
+    def _stacked(self, steps: Sequence[VecStep], name: str) -> Tensor:
         values = np.stack([getattr(step, name) for step in steps])
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
@@ -294,13 +301,13 @@ class CLEANPPO(OneFileAlgorithm):
 
 def tanh_network(sizes: Sequence[int], last_gain: float) -> nn.Sequential:
     """Return a network with orthogonal weights, whose last layer has its own gain."""
-    layers: list[Any] = []
+    layers: list[nn.Module] = []
     for n_in, n_out in itertools.pairwise(sizes):
         linear = nn.Linear(n_in, n_out)
         nn.init.orthogonal_(linear.weight, math.sqrt(2))
         nn.init.zeros_(linear.bias)
         layers += [linear, nn.Tanh()]
-    nn.init.orthogonal_(layers[-2].weight, last_gain)
+    nn.init.orthogonal_(linear.weight, last_gain)
     return nn.Sequential(*layers[:-1])
 
 

@@ -13,16 +13,13 @@ from the replay buffer and does, in this order:
 
 All updates of a round are one compiled call, and while it computes, the environments take their
 next steps; what else makes it fast, and the options for sparse rewards, are those of `jaxsac`.
-
-Metrics: train/critic_loss, train/actor_loss, train/q_mean, train/critic_variance (over the target
-critics), and per environment step train/rollout_q_step.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from functools import partial
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -30,76 +27,47 @@ import numpy as np
 import optax
 import torch
 from gymnasium import spaces
-from jax import Array
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor
 
-from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm
 from scilab_rl.algorithms.intrinsic.build import make_intrinsic_reward
-from scilab_rl.algorithms.jax_engine import (
-    Batch,
-    Normalizer,
-    Params,
-    Rounds,
-    State,
-    as_updates,
-    dense_layers,
-    forward,
-    precision_named,
-    widest_returns,
+from scilab_rl.learning.jax_engine import Array, Batch, Params, State, forward
+from scilab_rl.learning.jax_off_policy import (
+    JaxOffPolicyAlgorithm,
+    Losses,
+    UpdateSettings,
+    adam_step,
+    bellman_targets,
+    delayed,
+    q_values,
+    random_subset,
+    squared_error,
+    update_critics,
+    update_targets,
 )
 
 
-class Settings(NamedTuple):
-    """What an update is compiled for; see `JAXTD3`."""
+@dataclass(frozen=True)
+class Settings(UpdateSettings):
+    """The constants of an update, for which it is compiled; see `JAXTD3`."""
 
-    learning_rate: float
-    gamma: float
-    tau: float
-    n_target_critics: int
-    policy_delay: int
     target_policy_noise: float
     target_noise_clip: float
     action_penalty: float
-    precision: str
 
 
-class JAXTD3(OneFileAlgorithm):
+class JAXTD3(JaxOffPolicyAlgorithm):
     """Twin delayed deep deterministic policy gradient, compiled.
 
     Args:
-        env: Vector environment with continuous actions.
         learning_rate: Of actor and critics.
-        buffer_size: Transitions that the replay buffer holds.
-        learning_starts: Environment steps with random actions before the first update.
-        batch_size: Transitions per update.
-        tau: How far the target networks follow in each update.
-        gamma: Discount factor.
-        train_freq: Steps of each environment between rounds of updates.
-        gradient_steps: Updates per round; -1: as many as steps were collected.
-        action_noise: Deviation of the normal noise on actions, as a share of half their range.
-        random_actions: Share of uniformly random actions after ``learning_starts``.
-        n_critics: Number of critics.
-        n_target_critics: How many of them, drawn at random for each update, give the target;
-            None: all.
         policy_delay: Critic updates per update of the actor.
+        action_noise: Deviation of the normal noise on actions, as a share of half their range.
         target_policy_noise: Deviation of the noise on the target's actions; 0: none.
         target_noise_clip: Largest noise on the target's actions.
         action_penalty: Weight of the squared actions in the actor's loss.
-        bounded_targets: Whether targets are clipped to what returns can be.
-        normalize_observations: Whether the networks see observations of unit variance.
-        layer_norm: Whether the critics normalise their hidden layers.
-        net_arch: Sizes of the hidden layers of actor and critics.
-        precision: ``float32`` or ``bfloat16``, of the matrix products.
-        overlap: Whether the environments step while a round of updates computes.
-        replay_buffer_class: None: a plain replay buffer.
-        replay_buffer_kwargs: Further arguments of the replay buffer.
         intrinsic: A reward that the agent gives itself, mixed into the environment's; see
             `scilab_rl.algorithms.intrinsic`. None: none.
-        seed: See `OneFileAlgorithm`.
-        device: Where JAX computes: ``auto`` (a GPU if JAX has one), ``cpu`` or ``cuda``.
+        **common: Critics, batch size, gamma and so on, see `JaxOffPolicyAlgorithm`.
     """
 
     supported_action_spaces = (spaces.Box,)
@@ -107,104 +75,26 @@ class JAXTD3(OneFileAlgorithm):
     def __init__(
         self,
         *,
-        env: VecEnv,
         learning_rate: float = 1e-3,
-        buffer_size: int = 1_000_000,
-        learning_starts: int = 100,
-        batch_size: int = 256,
-        tau: float = 0.005,
-        gamma: float = 0.99,
-        train_freq: int = 1,
-        gradient_steps: int = -1,
-        action_noise: float = 0.1,
-        random_actions: float = 0.0,
-        n_critics: int = 2,
-        n_target_critics: int | None = None,
         policy_delay: int = 2,
+        action_noise: float = 0.1,
         target_policy_noise: float = 0.2,
         target_noise_clip: float = 0.5,
         action_penalty: float = 0.0,
-        bounded_targets: bool = False,
-        normalize_observations: bool = False,
-        layer_norm: bool = False,
-        net_arch: Sequence[int] = (256, 256),
-        precision: str = "float32",
-        overlap: bool = True,
-        replay_buffer_class: type[ReplayBuffer] | None = None,
-        replay_buffer_kwargs: dict[str, Any] | None = None,
-        intrinsic: str | Mapping[str, Any] | None = None,
-        seed: int | None = None,
-        device: str = "auto",
+        intrinsic: str | Mapping[str, object] | None = None,
+        **common: Any,
     ) -> None:
-        super().__init__(env=env, seed=seed, device="cpu")  # where PyTorch is: at the buffer
-        self.learning_rate = learning_rate
-        self.learning_starts = learning_starts
-        self.batch_size = batch_size
-        self.gamma = gamma
-        self.train_freq = train_freq
-        self.gradient_steps = gradient_steps
+        super().__init__(learning_rate=learning_rate, policy_delay=policy_delay, **common)
         self.action_noise = action_noise
-        self.random_actions = random_actions
-        self.bounded_targets = bounded_targets
-        self.overlap = overlap
-
-        settings = Settings(
-            learning_rate=learning_rate,
-            gamma=gamma,
-            tau=tau,
-            n_target_critics=min(n_target_critics or n_critics, n_critics),
-            policy_delay=policy_delay,
+        settings = Settings.of(
+            self,
             target_policy_noise=target_policy_noise,
             target_noise_clip=target_noise_clip,
             action_penalty=action_penalty,
-            precision=precision_named(precision),
         )
-        sizes = (self.n_observations, self.n_actions, net_arch)
-        state = initial_state(*sizes, n_critics, layer_norm, learning_rate)
-        self.rounds = Rounds(partial(update, settings), state, ["actor", "critic"], device)
-        self.normalizer = Normalizer(self.n_observations, active=normalize_observations)
-        self.reward_bounds = np.array([np.inf, -np.inf])
-
-        self.replay_buffer = self.make_replay_buffer(
-            buffer_size, replay_buffer_class, replay_buffer_kwargs
-        )
+        state = initial_state(*self.draw_networks(self.n_actions), learning_rate)
+        self.start_learning(update, settings, state)
         self.intrinsic = make_intrinsic_reward(intrinsic, self)
-
-    def iterate(self, callback: BaseCallback) -> bool:
-        """Collect steps while the last round of updates computes, then start the next round."""
-        if not self.collect(callback):
-            return False
-        batch = self.draw() if self.num_timesteps > self.learning_starts else None
-        self.finish_round()
-        if batch is not None:
-            self.rounds.start(batch)
-        if not self.overlap:
-            self.finish_round()
-        return True
-
-    def collect(self, callback: BaseCallback) -> bool:
-        """Act and store what happens; return False when the callback wants to stop."""
-        callback.on_rollout_start()
-        for _ in range(self.train_freq):
-            actions = self.explore()
-            env_actions = self.to_env_actions(actions)
-            self._record_step(self._last_obs, env_actions)
-            step = self.step(env_actions, callback)
-            if step is None:
-                return False
-            self.store(step, actions.numpy())
-            self.normalizer.update(self.to_vector(step.next_observations).numpy())
-        callback.on_rollout_end()
-        return True
-
-    def explore(self) -> Tensor:
-        """Choose the actions for the next step: random ones at first, and later now and then."""
-        random_actions = torch.as_tensor(self.from_env_actions(self.sample_env_actions()))
-        if self.num_timesteps < self.learning_starts:
-            return random_actions
-        actions = self.act(self.to_vector(self._last_obs), deterministic=False)
-        is_random = torch.as_tensor(np.random.random((self.n_envs, 1)) < self.random_actions)
-        return torch.where(is_random, random_actions, actions)
 
     def act(self, observations: Tensor, deterministic: bool) -> Tensor:
         """Choose actions in [-1, 1], with the networks of the last finished round."""
@@ -215,67 +105,9 @@ class JAXTD3(OneFileAlgorithm):
             actions = np.clip(actions + noise, -1.0, 1.0)
         return torch.as_tensor(actions, dtype=torch.float32)
 
-    def draw(self) -> Batch:
-        """Draw the transitions of the next round."""
-        n_updates = self.gradient_steps
-        if n_updates < 0:
-            n_updates = self.train_freq * self.n_envs
-        batch = self.sample(n_updates * self.batch_size)
-        if self.intrinsic is not None:
-            batch = self.intrinsic.add_to(batch)
-        rewards = batch.rewards.numpy().ravel()
-        bounds = np.array([-np.inf, np.inf], dtype=np.float32)
-        if self.bounded_targets:
-            bounds = widest_returns(rewards, self.gamma, self.reward_bounds)
-        return as_updates(
-            n_updates,
-            observations=self.normalizer(batch.observations.numpy()),
-            actions=batch.actions.numpy(),
-            rewards=rewards,
-            next_observations=self.normalizer(batch.next_observations.numpy()),
-            dones=batch.dones.numpy().ravel(),
-            return_bounds=np.tile(bounds, n_updates),
-        )
 
-    def finish_round(self) -> None:
-        """Wait for the round under way, and record how it went."""
-        losses = self.rounds.finish(
-            learning_rate=self.learning_rate, gamma=self.gamma, batch_size=self.batch_size
-        )
-        self.n_updates = self.rounds.n_started
-        for name, values in losses.items():
-            self.logger.record(f"train/{name}", values.mean())
-
-    def _record_step(self, observations: Observation, env_actions: np.ndarray) -> None:
-        """Record what the agent of the first environment thinks of what it does."""
-        q = LazyNumber(lambda: self.q_values(observations, env_actions)[0].min())
-        self.logger.record("train/rollout_q_step", q)
-
-    def critic(self, observations: Tensor, actions: Tensor) -> Tensor:
-        """Return what each critic thinks. Shapes: result ``(batch, n_critics)``."""
-        inputs = np.hstack([self.normalizer(observations.numpy()), actions.numpy()])
-        values = forward(self.rounds.networks["critic"], inputs, xp=np)
-        return torch.as_tensor(values[..., 0].T, dtype=torch.float32)
-
-    def q_values(self, observations: Observation, env_actions: np.ndarray) -> Tensor:
-        """Return what each critic thinks of a batch of steps. Shapes: ``(batch, n_critics)``."""
-        actions = torch.as_tensor(self.from_env_actions(env_actions))
-        return self.critic(self.to_vector(observations), actions)
-
-
-def initial_state(
-    n_observations: int,
-    n_actions: int,
-    net_arch: Sequence[int],
-    n_critics: int,
-    layer_norm: bool,
-    learning_rate: float,
-) -> State:
+def initial_state(actor: Params, critic: Params, learning_rate: float) -> State:
     """Return weights and moments before the first update."""
-    actor = dense_layers([n_observations, *net_arch, n_actions])
-    critic = dense_layers(
-        [n_observations + n_actions, *net_arch, 1], n=n_critics, layer_norm=layer_norm
-    )
     adam = optax.adam(learning_rate)
     return {
         "actor": actor,
@@ -290,43 +122,18 @@ def initial_state(
 
 def update(
     settings: Settings, state: State, batch: Batch, key: Array, index: Array
-) -> tuple[State, dict[str, Array]]:
-    """Update critics, then actor, then target networks; pure.
-
-    Args:
-        settings: Constants.
-        state: As `initial_state` makes it.
-        batch: Transitions.
-        key: Of this update's random numbers.
-        index: Number of updates before this one.
-
-    Returns:
-        The new state and the losses.
-    """
+) -> tuple[State, Losses]:
+    """Update critics, then actor, then target networks; see `UpdateRunner`."""
     targets, next_q = smoothed_targets(settings, state, batch, key)
-    (loss, q), gradient = jax.value_and_grad(critic_loss, has_aux=True)(
-        state["critic"], batch, targets, settings.precision
-    )
-    state = descend(state, "critic", gradient, settings.learning_rate)
-    losses = {
-        "critic_loss": loss,
-        "q_mean": q.mean(),
-        "critic_variance": next_q.var(axis=0).mean(),
-    }
+    state, losses = update_critics(settings, state, batch, targets, next_q, squared_error)
 
     def update_actor(state: State) -> State:
         loss, gradient = jax.value_and_grad(actor_loss)(state["actor"], settings, state, batch)
-        return descend(state, "actor", gradient, settings.learning_rate) | {"actor_loss": loss}
+        return adam_step(state, "actor", gradient, settings.learning_rate) | {"actor_loss": loss}
 
-    if settings.policy_delay == 1:
-        state = update_actor(state)
-    else:
-        is_due = index % settings.policy_delay == 0
-        state = jax.lax.cond(is_due, update_actor, lambda state: state, state)
-    for name in ("actor", "critic"):
-        target = optax.incremental_update(state[name], state[f"{name}_target"], settings.tau)
-        state |= {f"{name}_target": target}
-    return state, losses | {"actor_loss": state["actor_loss"]}
+    state = delayed(settings, index, update_actor, state)
+    losses["actor_loss"] = state["actor_loss"]
+    return update_targets(state, ["actor", "critic"], settings.tau), losses
 
 
 def smoothed_targets(
@@ -344,24 +151,8 @@ def smoothed_targets(
         noise = jnp.clip(noise, -settings.target_noise_clip, settings.target_noise_clip)
         actions = jnp.clip(actions + noise, -1, 1)
     next_q = q_values(state["critic_target"], batch.next_observations, actions, settings.precision)
-    asked = next_q
-    if settings.n_target_critics < len(next_q):
-        chosen = jax.random.permutation(subset_key, len(next_q))[: settings.n_target_critics]
-        asked = next_q[chosen]
-    targets = batch.rewards + settings.gamma * (1 - batch.dones) * asked.min(axis=0)
-    return jnp.clip(targets, *batch.return_bounds), next_q
-
-
-def critic_loss(
-    critic: Params, batch: Batch, targets: Array, precision: str
-) -> tuple[Array, Array]:
-    """Return the sum of J(Q_i) over the critics (algorithm 1), and their values.
-
-    Shapes:
-        targets: ``(batch,)``; values: ``(n_critics, batch)``.
-    """
-    q = q_values(critic, batch.observations, batch.actions, precision)
-    return jnp.square(q - targets).mean(axis=1).sum(), q
+    value = random_subset(next_q, settings.n_target_critics, subset_key).min(axis=0)
+    return bellman_targets(settings, batch, value), next_q
 
 
 def actor_loss(actor: Params, settings: Settings, state: State, batch: Batch) -> Array:
@@ -375,16 +166,3 @@ def actor_loss(actor: Params, settings: Settings, state: State, batch: Batch) ->
 def policy(actor: Params, observations: Array, precision: str) -> Array:
     """Return pi(s) in [-1, 1]. Shapes: ``(batch, n_actions)``."""
     return jnp.tanh(forward(actor, observations, precision=precision))
-
-
-def q_values(critic: Params, observations: Array, actions: Array, precision: str) -> Array:
-    """Return the value that each critic gives to each pair. Shapes: ``(n_critics, batch)``."""
-    inputs = jnp.concatenate([observations, actions], axis=-1)
-    return forward(critic, inputs, precision=precision)[..., 0]
-
-
-def descend(state: State, name: str, gradient: Any, learning_rate: float) -> State:
-    """Take one step of Adam with one entry of the state."""
-    optimizer = f"{name}_optimizer"
-    step, moments = optax.adam(learning_rate).update(gradient, state[optimizer])
-    return state | {name: optax.apply_updates(state[name], step), optimizer: moments}

@@ -10,17 +10,13 @@ Sutton and Barto, 2018, "Reinforcement Learning: An Introduction", second editio
 
 What differs from the book: the two functions are neural networks; Adam scales the steps alpha_w
 and alpha_theta; the mean over several environments is taken.
-
-Metrics: train/td_error, train/actor_loss, train/critic_loss, train/entropy and, per environment
-step, train/rollout_value_step.
 """
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from typing import Any
 
+import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
@@ -28,7 +24,10 @@ from stable_baselines3.common.vec_env import VecEnv
 from torch import Tensor, nn
 from torch.distributions import Categorical
 
-from scilab_rl.algorithms.base import LazyNumber, Observation, OneFileAlgorithm, Step
+from scilab_rl.envs.types import Observation
+from scilab_rl.envs.vec_step import VecStep
+from scilab_rl.learning.base import LazyNumber, OneFileAlgorithm
+from scilab_rl.learning.nn import gradient_step, network
 
 
 class ONESTEPAC(OneFileAlgorithm):
@@ -46,6 +45,13 @@ class ONESTEPAC(OneFileAlgorithm):
     """
 
     supported_action_spaces = (spaces.Discrete,)
+    metrics = (
+        "train/td_error",
+        "train/actor_loss",
+        "train/critic_loss",
+        "train/entropy",
+        "train/rollout_value_step",
+    )
 
     def __init__(
         self,
@@ -63,8 +69,9 @@ class ONESTEPAC(OneFileAlgorithm):
         self.learning_rate = learning_rate
         self.gamma = gamma
         self.discount_updates = discount_updates
-        self.actor = network([self.n_observations, *net_arch, self.n_actions]).to(self.device)
-        self.critic = network([self.n_observations, *net_arch, 1]).to(self.device)
+        sizes = [self.n_observations, *net_arch]
+        self.actor = network([*sizes, self.n_actions], nn.Tanh).to(self.device)
+        self.critic = network([*sizes, 1], nn.Tanh).to(self.device)
         self.actor_optimizer = torch.optim.Adam(self.actor.parameters(), learning_rate, fused=True)
         self.critic_optimizer = torch.optim.Adam(
             self.critic.parameters(), critic_learning_rate, fused=True
@@ -97,7 +104,7 @@ class ONESTEPAC(OneFileAlgorithm):
         """Return pi(.|S). Shapes: ``(batch, n_observations)``."""
         return Categorical(logits=self.actor(observations), validate_args=False)
 
-    def train(self, step: Step, actions: Tensor) -> None:
+    def train(self, step: VecStep, actions: Tensor) -> None:
         """Update value function and policy once."""
         observations = self.to_vector(step.observations)
         policy = self.policy(observations)
@@ -110,33 +117,25 @@ class ONESTEPAC(OneFileAlgorithm):
         critic_loss = 0.5 * delta.square().mean()
         discounts = self.discounts if self.discount_updates else torch.ones_like(self.discounts)
         actor_loss = -(discounts * delta.detach() * policy.log_prob(actions)).mean()
-        descend(self.critic_optimizer, critic_loss)
-        descend(self.actor_optimizer, actor_loss)
+        losses = {
+            "critic_loss": [gradient_step(self.critic_optimizer, critic_loss)],
+            "actor_loss": [gradient_step(self.actor_optimizer, actor_loss)],
+        }
 
         ended = torch.as_tensor(step.dones, device=self.device)
         self.discounts = torch.where(ended, 1.0, self.gamma * self.discounts)
         self.n_updates += 1
-        self.record_losses(
-            {"critic_loss": [critic_loss.detach()], "actor_loss": [actor_loss.detach()]}
-        )
+        self.record_losses(losses)
         self.logger.record("train/td_error", delta.detach().mean())
         self.logger.record("train/entropy", LazyNumber(lambda: policy.entropy().mean()))
 
-    def _tensor(self, values: Any) -> Tensor:
+    def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.as_tensor(values, dtype=torch.float32, device=self.device)
 
     @torch.no_grad()
     def value(self, observations: Observation) -> Tensor:
         """Return v(S) for a batch of observations. Shapes: ``(batch,)``."""
         return self.critic(self.to_vector(observations)).squeeze(1)
-
-
-def network(sizes: Sequence[int]) -> nn.Sequential:
-    """Return a network with tanh between its layers."""
-    layers: list[nn.Module] = []
-    for n_in, n_out in itertools.pairwise(sizes):
-        layers += [nn.Linear(n_in, n_out), nn.Tanh()]
-    return nn.Sequential(*layers[:-1])
 
 
 def td_target(rewards: Tensor, terminated: Tensor, next_values: Tensor, gamma: float) -> Tensor:
@@ -146,10 +145,3 @@ def td_target(rewards: Tensor, terminated: Tensor, next_values: Tensor, gamma: f
         all tensors and the result: ``(batch,)``.
     """
     return rewards + gamma * (1 - terminated) * next_values
-
-
-def descend(optimizer: torch.optim.Optimizer, loss: Tensor) -> None:
-    """Take one step down the gradient."""
-    optimizer.zero_grad()
-    loss.backward()
-    optimizer.step()

@@ -6,7 +6,7 @@ import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
 
-from scilab_rl.algorithms.base import OneFileAlgorithm
+from scilab_rl.learning.base import OneFileAlgorithm
 
 
 class RANDOM(OneFileAlgorithm):

@@ -85,7 +85,7 @@ class Blocks(FetchTask):
             return blocks
         return np.concatenate([self.gripper_position(), blocks])
 
-    def distance(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> Any:
+    def distance(self, achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
         """Return the distance of the part that is farthest from its place.
 
         Shapes:
@@ -95,7 +95,7 @@ class Blocks(FetchTask):
         parts = difference.reshape(*difference.shape[:-1], -1, 3)
         return np.linalg.norm(parts, axis=-1).max(axis=-1)
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return positions, angles and velocities. Shapes: ``(10 + 12 n_blocks,)``."""
         speeds = self._block_velocities()
         return np.concatenate(

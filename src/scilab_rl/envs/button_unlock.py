@@ -71,7 +71,7 @@ class ButtonUnlock(FetchTask):
         """Return the gripper's place. Shapes: ``(2,)`` in m."""
         return self.gripper_position()[:2]
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return places, movement and locks. Shapes: ``(4 + 3 n_buttons,)``."""
         return np.concatenate(
             [
@@ -87,9 +87,9 @@ class ButtonUnlock(FetchTask):
         height = self.start[2] - self.gripper_position()[2]
         return np.array([*(STEP_LENGTH * action), height])
 
-    def apply(self, action: np.ndarray) -> None:
+    def apply_action(self, action: np.ndarray) -> None:
         """Move, press what is below the gripper, and open the cage after the last button."""
-        super().apply(action)
+        super().apply_action(action)
         distances = np.linalg.norm(self._blue_places() - self.achieved_goal(), axis=1)
         self.pressed |= distances <= self.threshold
         self.data.mocap_pos[self._buttons[:-1], 2] = TABLE_HEIGHT - _PRESSED * self.pressed

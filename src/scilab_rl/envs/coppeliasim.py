@@ -12,20 +12,20 @@ or set ``COPPELIASIM_ROOT`` and let the environments start them.
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import importlib.util
 import os
 import subprocess
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
+from scilab_rl import files
 from scilab_rl.envs.goal import GoalEnv
-from scilab_rl.errors import ConfigError, EnvironmentError_, MissingDependencyError
+from scilab_rl.errors import ConfigError, EnvironmentFailure, MissingDependencyError
 
 _CLIENT = "coppeliasim_zmqremoteapi_client"
 _PORT_STRIDE = 2  # a simulator takes two ports
@@ -38,7 +38,8 @@ class CoppeliaSimEnv(GoalEnv):
     """A `GoalEnv` whose world is a CoppeliaSim scene, one simulation step per environment step.
 
     A subclass builds its scene in `build_scene` (once), and has `sample_goal`, `achieved_goal`,
-    `observe` and `set_control`. ``self.sim`` is CoppeliaSim's API as its manual describes it.
+    `get_observation` and `set_control`. ``self.sim`` is CoppeliaSim's API as its manual describes
+    it.
 
     Args:
         host: Where the simulators run.
@@ -89,20 +90,20 @@ class CoppeliaSimEnv(GoalEnv):
         """Turn an action into controls. Shapes: ``(action_size,)``, in [-1, 1]."""
         raise NotImplementedError
 
-    def restart(self) -> None:
+    def reset_state(self) -> None:
         """Stop the simulation, place the objects and start it again."""
         with self._simulator.errors_named():
             self._stop()
             self.place_objects()
             self.sim.startSimulation()
 
-    def apply(self, action: np.ndarray) -> None:
+    def apply_action(self, action: np.ndarray) -> None:
         """Act and let one simulation step pass."""
         with self._simulator.errors_named():
             self.set_control(action)
             self.sim.step()
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray | None:
         """Return what the camera sees. Shapes: ``(256, 256, 3)``, uint8."""
         with self._simulator.errors_named():
             if self._camera is None:
@@ -150,7 +151,7 @@ class CoppeliaSimEnv(GoalEnv):
             self.sim.setJointTargetForce(joint, float(force))
 
     def collide(self, first: int, second: int) -> bool:
-        """Tell whether two shapes touch."""
+        """Return whether two shapes touch."""
         return bool(self.sim.checkCollision(first, second)[0])
 
     def create_shape(
@@ -188,7 +189,7 @@ class CoppeliaSimEnv(GoalEnv):
         deadline = time.monotonic() + self._simulator.timeout_seconds
         while self.sim.getSimulationState() != self.sim.simulation_stopped:
             if time.monotonic() > deadline:
-                raise EnvironmentError_(f"{self._simulator}: the simulation does not stop.")
+                raise EnvironmentFailure(f"{self._simulator}: the simulation does not stop.")
             time.sleep(0.01)
 
     def _create_camera(self) -> int:
@@ -229,24 +230,22 @@ class Simulator:
         """Return the first simulator that no other environment of this machine uses.
 
         Raises:
-            EnvironmentError_: If all are in use.
+            EnvironmentFailure: If all are in use.
         """
         for port in range(first_port, first_port + _PORT_STRIDE * _MAX_SIMULATORS, _PORT_STRIDE):
             path = Path(tempfile.gettempdir()) / f"scilab_rl-coppeliasim-{host}-{port}.lock"
             lock = path.open("w", encoding="utf-8")
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except OSError:
-                lock.close()
-                continue
-            return cls(host, port, timeout_seconds, lock)
-        raise EnvironmentError_(f"All {_MAX_SIMULATORS} ports from {first_port} are in use.")
+            with contextlib.suppress(OSError):
+                if files.lock(lock, wait=False):
+                    return cls(host, port, timeout_seconds, lock)
+            lock.close()
+        raise EnvironmentFailure(f"All {_MAX_SIMULATORS} ports from {first_port} are in use.")
 
     def connect(self) -> Any:
         """Connect to the simulator, start it where that is possible, and return its API.
 
         Raises:
-            EnvironmentError_: If none answers.
+            EnvironmentFailure: If none answers.
         """
         if not self._answers():
             self._start()
@@ -262,7 +261,7 @@ class Simulator:
             yield
         except (zmq.Again, zmq.ZMQError) as error:
             self._drop_client()
-            raise EnvironmentError_(
+            raise EnvironmentFailure(
                 f"{self} has not answered for {self.timeout_seconds:g} s. Is it still running?"
             ) from error
 
@@ -316,13 +315,13 @@ class Simulator:
         root = os.environ.get("COPPELIASIM_ROOT")
         option = f"-GzmqRemoteApi.rpcPort={self.port}"
         if root is None or self.host not in ("localhost", "127.0.0.1"):
-            raise EnvironmentError_(
+            raise EnvironmentFailure(
                 f"No {self} answers. Start one with `coppeliaSim.sh -h {option}` (each environment "
                 "needs its own, a run at least two), or set COPPELIASIM_ROOT to its folder."
             )
         program = Path(root) / "coppeliaSim.sh"
         if not program.is_file():
-            raise EnvironmentError_(f"COPPELIASIM_ROOT={root} has no coppeliaSim.sh.")
+            raise EnvironmentFailure(f"COPPELIASIM_ROOT={root} has no coppeliaSim.sh.")
         self._process = subprocess.Popen(
             [str(program), "-h", option],
             stdin=subprocess.DEVNULL,
@@ -332,11 +331,11 @@ class Simulator:
         deadline = time.monotonic() + _START_SECONDS
         while not self._answers():
             if self._process.poll() is not None:
-                raise EnvironmentError_(f"{program} ended with {self._process.returncode}.")
+                raise EnvironmentFailure(f"{program} ended with {self._process.returncode}.")
             if time.monotonic() > deadline:
-                raise EnvironmentError_(f"{program} does not answer after {_START_SECONDS:g} s.")
+                raise EnvironmentFailure(f"{program} does not answer after {_START_SECONDS:g} s.")
 
 
-def _plain(values: Any) -> list[float]:
+def _plain(values: Iterable[float]) -> list[float]:
     """Return a list of Python's own numbers; the client's encoder knows no others."""
     return [float(value) for value in values]

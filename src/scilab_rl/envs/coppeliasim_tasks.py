@@ -83,7 +83,7 @@ class CoppeliaReach(CoppeliaSimEnv):
         """Return the tip's place. Shapes: ``(3,)`` in m."""
         return self.position(self._tip)
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return the angles and the tip's place. Shapes: ``(9,)``."""
         angles = self._angles()
         return np.concatenate([np.cos(angles), np.sin(angles), self.position(self._tip)])
@@ -145,7 +145,7 @@ class CoppeliaDrive(CoppeliaSimEnv):
         """Return the robot's place. Shapes: ``(2,)`` in m."""
         return self.position(self._robot)[:2]
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return place and heading. Shapes: ``(4,)``."""
         heading = self._state[2]
         return np.array([*self.achieved_goal(), np.cos(heading), np.sin(heading)])

@@ -1,4 +1,4 @@
-"""A short hash that changes when an environment's behaviour changes under the same name."""
+"""A short hash that changes when an environment's behavior changes under the same name."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def scripted_action(space: gym.Space, rng: np.random.Generator) -> Any:
     return space.sample()
 
 
-def _update(digest: Any, value: Any) -> None:
+def _update(digest: hashlib._Hash, value: object) -> None:
     if isinstance(value, dict):
         for key in sorted(value):
             digest.update(str(key).encode())

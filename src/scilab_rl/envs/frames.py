@@ -2,65 +2,98 @@
 
 from __future__ import annotations
 
-import logging
+import math
 import sys
+import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
-_log = logging.getLogger(__name__)
+from scilab_rl.envs.pictures import PictureForm
+
+DEFAULT_FPS = 25.0
 FRAME_KEY = "scilab_rl.frame"
 STATE_KEY = "scilab_rl.simulator_state"
 
 
-class FrameCapture(gym.Wrapper):
+class FrameCapture:
     """Renders after each reset and step while it is switched on, and puts the frame into ``info``.
 
     Vector environments reset a finished environment within the same call, so that a picture taken
-    from outside would already show the next episode. The simulator's state is put beside it.
+    from outside would already show the next episode. The simulator's state is stored with it.
+
+    A frame is ``(height, width, 3)`` in uint8, whatever the environment returns; where it cannot be
+    drawn, it is the reason, as text, and the task continues.
 
     Args:
         env: An environment with ``render_mode="rgb_array"``.
     """
 
     def __init__(self, env: gym.Env) -> None:
-        super().__init__(env)
-        self.wanted = False
-        self.capturing = False
+        self.env = env
+        self._wanted = self._capturing = False
+        self._form = PictureForm()
+        self._reason = ""  # why the first frame that is missing cannot be drawn
+        self._is_broken = False
 
-    def capture_frames(self, on: bool) -> None:
+    def leave_out(self, reason: str) -> None:
+        """Render nothing from now on, because it cannot be done here."""
+        self._reason, self._is_broken = reason, True
+
+    def capture(self, on: bool) -> None:
         """Switch capturing on, from the next reset, or off, at once."""
-        self.wanted = on
-        self.capturing = self.capturing and on
+        self._wanted = on
+        self._capturing = self._capturing and on
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
-        """Reset and render."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self.capturing = self.wanted
-        return observation, self._with_frame(info)
+    def begin_episode(self, info: dict[str, object]) -> None:
+        """Add the first scene of an episode to the info of its reset."""
+        self._capturing = self._wanted
+        self.add_to(info)
 
-    def step(self, action: Any) -> Any:
-        """Step and render."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        return observation, reward, terminated, truncated, self._with_frame(info)
-
-    def _with_frame(self, info: dict[str, Any]) -> dict[str, Any]:
-        if not self.capturing:
-            return info
+    def add_to(self, info: dict[str, object]) -> None:
+        """Add the scene after a step to its info."""
+        if not self._capturing:
+            return
         state = simulator_state(self.env)
+        info[FRAME_KEY] = self._frame()
+        if state is not None:
+            # Fetch's renderer runs the constraint solver, which would change the next step in the
+            # last bits: an episode that is watched must be the one that is not.
+            set_simulator_state(self.env, state)
+            info[STATE_KEY] = state
+
+    def _frame(self) -> np.ndarray | str:
+        """Return a picture, or why there is none; the first reason stays, so that it is one."""
+        if self._is_broken:
+            return self._reason
         try:
-            frame = np.asarray(self.env.render())
-        except Exception as error:  # noqa: BLE001 - whatever a renderer raises, learning goes on
-            self.capturing = self.wanted = False
-            _log.warning("Rendering is switched off: %s: %s", type(error).__name__, error)
-            return info
-        if state is None:
-            return {**info, FRAME_KEY: frame}
-        # Fetch's renderer runs the constraint solver, which would change the next step in the last
-        # bits: an episode that is watched must be the one that is not.
-        set_simulator_state(self.env, state)
-        return {**info, FRAME_KEY: frame, STATE_KEY: state}
+            with warnings.catch_warnings():  # Gymnasium's own checks; we report what matters
+                warnings.filterwarnings("ignore", r"(?s).*WARN: ", UserWarning)
+                rendered = self.env.render()
+        except Exception as error:  # noqa: BLE001 - whatever a renderer raises, learning continues
+            self._is_broken = True  # it may be slow in failing, and is not asked again
+            self._reason = self._reason or f"{type(error).__name__}: {error}"
+            return self._reason
+        try:
+            return self._form.picture(rendered)
+        except ValueError as error:
+            self._reason = self._reason or str(error)
+            return self._reason
+
+
+def frame_rate(metadata: Mapping[str, Any]) -> float:
+    """Return the ``render_fps`` of an environment's metadata, or 25 where it says none.
+
+    >>> [frame_rate(m) for m in ({"render_fps": 10}, {"render_fps": None}, {}, None)]
+    [10.0, 25.0, 25.0, 25.0]
+    """
+    try:
+        fps = float(metadata["render_fps"])
+    except (KeyError, TypeError, ValueError):
+        return DEFAULT_FPS
+    return fps if math.isfinite(fps) and fps > 0 else DEFAULT_FPS
 
 
 def simulator_state(env: gym.Env) -> np.ndarray | None:

@@ -67,10 +67,10 @@ class Hook(Blocks):
             x = self.np_random.uniform(*_FAR_X)
         return np.array([x, self.np_random.uniform(0.6, 0.75)])
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return positions, angles and velocities. Shapes: ``(22 + 12 n_blocks,)``."""
         velocity = self.data.qvel[self._hook_speed : self._hook_speed + 6] * self.dt
         rotation = self.data.xmat[self._hook]
         angular = rotation.reshape(3, 3) @ velocity[3:]
         hook = [self.data.xpos[self._hook], euler_angles(rotation), velocity[:3], angular]
-        return np.concatenate([super().observe(), *hook])
+        return np.concatenate([super().get_observation(), *hook])

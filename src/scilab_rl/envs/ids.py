@@ -1,7 +1,7 @@
-"""The environments that Scilab-RL brings itself, and the long ids that name their variants.
+"""The environments of Scilab-RL, and the long ids that name their variants.
 
 A variant such as ``Blocks-o2-gripper_above-v1`` is not one of thousands of registered ids: its name
-is read, and this one variant is registered when somebody asks for it.
+is read, and this one variant is registered on request.
 """
 
 from __future__ import annotations
@@ -9,12 +9,13 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import gymnasium as gym
 
 from scilab_rl.errors import ConfigError
 
+Arguments: TypeAlias = dict[str, Any]
 _VERSION = r"(?:-v\d+)?"
 
 
@@ -36,7 +37,7 @@ class Family:
     max_episode_steps: int
     grammar: str = ""
     pattern: str = "(?!)"
-    read: Callable[[Mapping[str, str]], dict[str, Any]] = field(default=lambda groups: {})
+    read: Callable[[Mapping[str, str]], Arguments] = field(default=lambda groups: {})
 
     @property
     def name(self) -> str:
@@ -49,7 +50,7 @@ class Family:
         return self.env_id.rpartition("-")[2]
 
 
-def _read_blocks(groups: Mapping[str, str]) -> dict[str, Any]:
+def _read_blocks(groups: Mapping[str, str]) -> Arguments:
     n_blocks = int(groups["n_blocks"])
     return {
         "n_blocks": n_blocks,
@@ -58,24 +59,26 @@ def _read_blocks(groups: Mapping[str, str]) -> dict[str, Any]:
     }
 
 
-def _read_hook(groups: Mapping[str, str]) -> dict[str, Any]:
+def _read_hook(groups: Mapping[str, str]) -> Arguments:
     n_blocks = int(groups["n_blocks"])
     return {"n_blocks": n_blocks, "max_episode_steps": 50 if n_blocks == 0 else 100 * n_blocks}
 
 
-def _read_buttons(groups: Mapping[str, str]) -> dict[str, Any]:
+def _read_buttons(groups: Mapping[str, str]) -> Arguments:
     n_buttons = int(groups["n_buttons"])
     return {"n_buttons": n_buttons, "max_episode_steps": 50 * (n_buttons + 1)}
 
 
-def _read_maze(groups: Mapping[str, str]) -> dict[str, Any]:
+def _read_maze(groups: Mapping[str, str]) -> Arguments:
+    continues = groups["continuing"] == "1"
     whole = {name: int(groups[name]) for name in ("frame_skip", "n_objects") if name in groups}
     return {
         "maze_map": groups["maze_map"],
         "reward_type": groups["reward_type"],
         "threshold": float(groups["threshold"]),
-        "continuing": groups["continuing"] == "1",
-        "reset_target": groups["reset_target"] == "1",
+        "continuing": continues,
+        # An episode that ends at the goal has no use for another one: rt1 has no effect then.
+        "reset_target": continues and groups["reset_target"] == "1",
         **whole,
         "max_episode_steps": int(groups["max_episode_steps"]),
     }
@@ -84,7 +87,7 @@ def _read_maze(groups: Mapping[str, str]) -> dict[str, Any]:
 _MAPS = ("open", "open_dg", "open_dgr", "small_open_dg", "small_open_dgr", "medium_custom_dgr")
 _REWARD = r"-(?P<reward_type>sparse|sparseneg|dense)"
 _PLACE = (
-    r"-(?P<threshold>\d+(?:\.\d+)?)"
+    r"-(?P<threshold>\d+(?:\.\d*)?|\.\d+)"
     rf"-(?P<maze_map>{'|'.join(_MAPS)})"
     r"-c(?P<continuing>[01])-rt(?P<reset_target>[01])-s(?P<max_episode_steps>[1-9]\d*)"
 )
@@ -183,7 +186,7 @@ def register_variant(name: str) -> tuple[str, str] | None:
     return None
 
 
-def _register(family: Family, env_id: str, arguments: dict[str, Any]) -> str:
+def _register(family: Family, env_id: str, arguments: Arguments) -> str:
     limit = arguments.pop("max_episode_steps", family.max_episode_steps)
     if env_id not in gym.registry:
         gym.register(env_id, family.entry_point, max_episode_steps=limit, kwargs=arguments)

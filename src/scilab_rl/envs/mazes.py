@@ -17,11 +17,12 @@ import numpy as np
 
 from scilab_rl.envs.goal import (
     Observation,
-    cost_per_step,
-    pay_at_goal,
     require_choice,
+    sparse_cost,
+    sparse_reward,
 )
 from scilab_rl.envs.mujoco_goal import MujocoGoalEnv, package_folder
+from scilab_rl.envs.types import Info
 from scilab_rl.errors import ConfigError
 
 MAPS = {
@@ -44,7 +45,7 @@ _MAX_OBJECTS = 8
 _OBJECT_RADIUS = 0.15
 
 
-def nearness(distance: Any, threshold: float) -> Any:
+def nearness(distance: np.ndarray, threshold: float) -> np.ndarray:
     """Return exp(-distance): 1 at the goal, 0 far away. Shapes: as ``distance``."""
     return np.exp(-np.asarray(distance, dtype=np.float32))
 
@@ -56,7 +57,7 @@ class Maze(MujocoGoalEnv):
         agent: MuJoCo description of the agent, whose first two coordinates are x and y.
         maze_map: A name in `MAPS`, or rows of one's own.
         cell_size: Edge of a cell, in m.
-        continuing: Whether the episode goes on at the goal.
+        continuing: Whether the episode continues at the goal.
         reset_target: Whether another goal is drawn when one is reached; only when continuing.
         n_objects: Things to push, each with a place of its own at the start.
         n_substeps: Simulation steps per environment step.
@@ -65,7 +66,7 @@ class Maze(MujocoGoalEnv):
     """
 
     rewards = MappingProxyType(
-        {"sparse": pay_at_goal, "sparseneg": cost_per_step, "dense": nearness}
+        {"sparse": sparse_reward, "sparseneg": sparse_cost, "dense": nearness}
     )
     wall_height = 0.4
     noise = 0.25  # of a cell, around its middle
@@ -88,8 +89,9 @@ class Maze(MujocoGoalEnv):
         self.n_objects = n_objects
         self.reset_target = bool(reset_target)
         self.cell_size = cell_size
-        self.starts = cell_centres(rows, "rc", cell_size)
-        self.goals = cell_centres(rows, "gc", cell_size)
+        self.starts = cell_centers(rows, "rc", cell_size)
+        self.goals = cell_centers(rows, "gc", cell_size)
+        self._refuse_unreachable_distance(kwargs.get("threshold"))
         self.camera = {
             "distance": 1.35 * cell_size * max(len(rows), len(rows[0])),
             "azimuth": 90.0,
@@ -98,6 +100,17 @@ class Maze(MujocoGoalEnv):
         }
         xml = _maze_xml(agent, rows, cell_size, self.wall_height * cell_size, n_objects)
         super().__init__(xml, n_substeps=n_substeps, terminate_on_success=not continuing, **kwargs)
+
+    def _refuse_unreachable_distance(self, threshold: object) -> None:
+        """Reject a threshold for which some place has no goal that is not reached already."""
+        places = np.concatenate([self.starts, self.goals]) if self.reset_target else self.starts
+        distances = np.linalg.norm(places[:, None] - self.goals[None], axis=-1)
+        farthest = float(distances.max(axis=1).min() + self.noise * self.cell_size)
+        if isinstance(threshold, (int, float)) and threshold >= farthest:
+            raise ConfigError(
+                f"threshold {threshold:g} is too large for this map: no goal would be farther away "
+                f"than that from each start, which allows less than {farthest:g} m."
+            )
 
     def place_objects(self) -> None:
         """Put the agent into a start cell, and the things somewhere else."""
@@ -123,7 +136,7 @@ class Maze(MujocoGoalEnv):
         """Return the agent's place. Shapes: ``(2,)`` in m."""
         return self.data.qpos[:2]
 
-    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, Info]:
         """Act for one step; with ``reset_target``, a reached goal is followed by another."""
         result = super().step(action)
         if self.reset_target and result[-1]["is_success"]:
@@ -146,7 +159,7 @@ class PointMaze(Maze):
 
     Args:
         maze_map: A name in `MAPS`, or rows of one's own.
-        continuing: Whether the episode goes on at the goal.
+        continuing: Whether the episode continues at the goal.
         reset_target: Whether another goal is drawn when one is reached.
         n_objects: Things in the way that can be pushed, from 0 to 8.
         threshold: Distance up to which the goal counts as reached, in m.
@@ -184,7 +197,7 @@ class PointMaze(Maze):
         self.data.qvel[:2] = np.clip(self.data.qvel[:2], -self.max_speed, self.max_speed)
         self.data.ctrl[:] = action
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return places and velocities. Shapes: ``(4 + 4 n_objects,)`` in m and m/s."""
         return np.concatenate([self.data.qpos, self.data.qvel])
 
@@ -210,7 +223,7 @@ class AntMaze(Maze):
 
     Args:
         maze_map: A name in `MAPS`, or rows of one's own.
-        continuing: Whether the episode goes on at the goal.
+        continuing: Whether the episode continues at the goal.
         reset_target: Whether another goal is drawn when one is reached.
         frame_skip: Simulation steps of 10 ms per environment step.
         threshold: Distance up to which the goal counts as reached, in m.
@@ -241,7 +254,7 @@ class AntMaze(Maze):
             **kwargs,
         )
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return what the ant feels of itself. Shapes: ``(27,)``."""
         return np.concatenate([self.data.qpos[2:], self.data.qvel])
 
@@ -250,7 +263,7 @@ def map_rows(maze_map: str | Sequence[str]) -> tuple[str, ...]:
     """Return the rows of a map, checked.
 
     Raises:
-        ConfigError: If there is no such map, or it is no rectangle in which one can start and go.
+        ConfigError: If there is no such map, or it is not a rectangle with free cells.
     """
     if isinstance(maze_map, str):
         require_choice("maze_map", maze_map, MAPS)
@@ -262,14 +275,14 @@ def map_rows(maze_map: str | Sequence[str]) -> tuple[str, ...]:
             f"is {list(rows)}."
         )
     for role, cells in (("starts", "rc"), ("goals", "gc")):
-        if len(cell_centres(rows, cells, 1.0)) == 0:
+        if len(cell_centers(rows, cells, 1.0)) == 0:
             raise ConfigError(f"env_kwargs.maze_map has no {role}: mark some with one of {cells}.")
-    if len(cell_centres(rows, "rgc", 1.0)) < 2:
+    if len(cell_centers(rows, "rgc", 1.0)) < 2:
         raise ConfigError("env_kwargs.maze_map needs a goal in another cell than the start.")
     return rows
 
 
-def cell_centres(rows: Sequence[str], kinds: str, cell_size: float) -> np.ndarray:
+def cell_centers(rows: Sequence[str], kinds: str, cell_size: float) -> np.ndarray:
     """Return the middles of the cells of some kinds; the middle of the map is the origin.
 
     Args:
@@ -300,7 +313,7 @@ def _maze_xml(
     world = root.find("worldbody")
     assert world is not None  # both files have one
     half, solid = cell_size / 2, {"contype": "1", "conaffinity": "1"}
-    for x, y in cell_centres(rows, "#", cell_size):
+    for x, y in cell_centers(rows, "#", cell_size):
         wall = {"pos": f"{x} {y} {height / 2}", "size": f"{half} {half} {height / 2}"}
         ET.SubElement(world, "geom", wall | solid, type="box", rgba="0.7 0.5 0.3 1")
     for index in range(n_objects):

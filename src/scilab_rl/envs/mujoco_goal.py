@@ -11,7 +11,8 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from scilab_rl.envs.goal import GoalEnv
+from scilab_rl.envs.goal import GoalEnv, Observation
+from scilab_rl.envs.types import Info
 
 ASSETS = Path(__file__).parent / "assets"
 _EVERYTHING = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -20,9 +21,10 @@ _EVERYTHING = int(mujoco.mjtState.mjSTATE_INTEGRATION)
 class MujocoGoalEnv(GoalEnv):
     """A `GoalEnv` whose world is a MuJoCo model.
 
-    A subclass gives the model to the constructor, and `sample_goal`, `achieved_goal`, `observe` as
-    in `GoalEnv`. It may change `set_control` (what an action does), `place_objects` (chance at the
-    start of an episode) and `goal_markers` (where the goal is drawn).
+    A subclass gives the model to the constructor, and `sample_goal`, `achieved_goal`,
+    `get_observation` as in `GoalEnv`. It may change `set_control` (what an action does),
+    `place_objects` (chance at the start of an episode) and `goal_markers` (where the goal is
+    drawn).
 
     Args:
         xml: The model as text.
@@ -39,7 +41,7 @@ class MujocoGoalEnv(GoalEnv):
     """
 
     metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 25}  # noqa: RUF012 - Gymnasium's
-    camera: Mapping[str, Any] = MappingProxyType({})
+    camera: Mapping[str, object] = MappingProxyType({})
 
     def __init__(
         self,
@@ -84,26 +86,26 @@ class MujocoGoalEnv(GoalEnv):
         """Return where to draw the goal: names of sites of the world body to places (3,) in m."""
         return {}
 
-    def restart(self) -> None:
+    def reset_state(self) -> None:
         """Go back to the start state exactly, and place the objects."""
         mujoco.mj_resetData(self.model, self.data)
         mujoco.mj_setState(self.model, self.data, self._start_state, _EVERYTHING)
         self.place_objects()
         mujoco.mj_forward(self.model, self.data)
 
-    def apply(self, action: np.ndarray) -> None:
+    def apply_action(self, action: np.ndarray) -> None:
         """Act and let the simulation run for ``n_substeps``."""
         self.set_control(action)
         mujoco.mj_step(self.model, self.data, nstep=self.n_substeps)
 
-    def step(self, action: np.ndarray) -> Any:
+    def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, Info]:
         """Act for one step, and show it with ``render_mode="human"``."""
         result = super().step(action)
         if self.render_mode == "human":
             self.render()
         return result
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray | None:
         """Return a frame with the goal's markers; the simulation's state stays as it is.
 
         Shapes:

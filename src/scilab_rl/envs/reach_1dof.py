@@ -35,7 +35,7 @@ class Reach1DOF(FetchTask):
         """Return the gripper's x."""
         return self.gripper_position()[:1]
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         """Return the gripper's x and its movement per step. Shapes: ``(2,)``."""
         return np.array([self.gripper_position()[0], self.gripper_velocity()[0]])
 

@@ -86,7 +86,7 @@ def _is_usable(spec: EnvSpec) -> bool:
 
 
 def suite_of(spec: EnvSpec) -> Suite | None:
-    """Return the suite of a registered environment; None for one of somebody else's."""
+    """Return the suite of a registered environment; None for other environments."""
     return suite_of_module(module_of(spec))
 
 
@@ -127,7 +127,7 @@ def _register(package: str) -> None:
 def _drop_import_notice(package: str) -> None:
     """Drop the notice about old Adroit rewards that Gymnasium-Robotics prints at each import.
 
-    It concerns ids that nobody here uses, and no logging level or warning filter reaches a print.
+    It concerns ids that are not used here, and no logging level or warning filter reaches a print.
     Its text comes from a table that can be imported before.
     """
     with contextlib.suppress(ImportError):
@@ -141,10 +141,11 @@ def _drop_import_notice(package: str) -> None:
 def _import_user_module(module: str, given: str) -> None:
     try:
         importlib.import_module(module)
-    except ImportError as error:
+    except Exception as error:
+        kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
         raise ConfigError(
             f"The environment '{given}' names the module '{module}', which cannot be imported: "
-            f"{error}."
+            f"{kind}{error}."
         ) from error
 
 

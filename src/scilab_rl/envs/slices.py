@@ -12,16 +12,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 
-from scilab_rl.envs.goal import cost_per_step, minus_distance, require_choice
+from scilab_rl.envs.goal import goal_distance, negative_distance, require_choice, sparse_cost
+from scilab_rl.envs.types import Info, ResetResult, StepResult
 from scilab_rl.errors import ConfigError
 
-_REWARDS = {"sparse": cost_per_step, "dense": minus_distance}
+_REWARDS = {"sparse": sparse_cost, "dense": negative_distance}
 
 
 class GoalFromSlices(gym.Wrapper):
@@ -68,13 +68,13 @@ class GoalFromSlices(gym.Wrapper):
             {"observation": space, "achieved_goal": goal, "desired_goal": goal}
         )
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin an episode."""
         vector, info = self.env.reset(seed=seed, options=options)
         observation = self._split(vector)
         return observation, {**info, "is_success": self._reached(observation)}
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Act; reward and success are those of the goal."""
         vector, own_reward, terminated, truncated, info = self.env.step(action)
         observation = self._split(vector)
@@ -84,13 +84,17 @@ class GoalFromSlices(gym.Wrapper):
         reward = float(self.compute_reward(*goals, info))
         return observation, reward, terminated, truncated, info
 
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def compute_reward(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         """Return the reward. Shapes: goals ``(..., goal_size)``, result ``(...)``."""
-        return self._reward(self._distance(achieved_goal, desired_goal), self.threshold)
+        return self._reward(goal_distance(achieved_goal, desired_goal), self.threshold)
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def compute_terminated(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         """Return whether the goal ends the episode. Shapes: as `compute_reward`."""
-        reached = self._distance(achieved_goal, desired_goal) <= self.threshold
+        reached = goal_distance(achieved_goal, desired_goal) <= self.threshold
         return reached & self._terminate_on_success
 
     def _split(self, vector: np.ndarray) -> dict[str, np.ndarray]:
@@ -101,12 +105,8 @@ class GoalFromSlices(gym.Wrapper):
         }
 
     def _reached(self, observation: dict[str, np.ndarray]) -> bool:
-        distance = self._distance(observation["achieved_goal"], observation["desired_goal"])
+        distance = goal_distance(observation["achieved_goal"], observation["desired_goal"])
         return bool(distance <= self.threshold)
-
-    @staticmethod
-    def _distance(achieved_goal: Any, desired_goal: Any) -> Any:
-        return np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
 
 
 def _checked_slice(name: str, given: Sequence[int], size: int) -> slice:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from typing import Any
 
 import gymnasium as gym
 import numpy as np
 
 from scilab_rl.envs.frames import simulator_state
+from scilab_rl.envs.types import Info, ResetResult, StepResult
 
 _log = logging.getLogger(__name__)
 UNSTABLE_KEY = "simulation_unstable"
@@ -36,19 +36,20 @@ class StabilityGuard(gym.Wrapper):
     def __init__(self, env: gym.Env) -> None:
         super().__init__(env)
         self.n_unstable = 0
-        self._warnings = env.unwrapped.data.warning  # type: ignore[attr-defined]
+        # A view of MuJoCo's own counters.
+        self._warnings = env.unwrapped.data.warning.number[_RESETTING]  # type: ignore[attr-defined]
         self._seen = 0
-        self._states: deque[Any] = deque(maxlen=N_STATES)
+        self._states: deque[np.ndarray | None] = deque(maxlen=N_STATES)
         _keep_warnings_out_of_the_folder()
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin an episode."""
         result = self.env.reset(seed=seed, options=options)
         self._seen = self._count()
         self._states.clear()
         return result
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Act, and look whether the simulation has reset itself meanwhile."""
         self._states.append(simulator_state(self.env))  # before the step: after it, it is reset
         observation, reward, terminated, truncated, info = self.env.step(action)
@@ -65,7 +66,7 @@ class StabilityGuard(gym.Wrapper):
         return observation, reward, terminated, truncated, info
 
     def _count(self) -> int:
-        return int(self._warnings.number[_RESETTING].sum())
+        return int(self._warnings.sum())
 
 
 def guard(env: gym.Env) -> gym.Env:

@@ -1,14 +1,15 @@
-"""Making vector environments from an id and a list of wrappers."""
+"""Making the environments of a run's configuration."""
 
 from __future__ import annotations
 
 import importlib
 import inspect
+import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -18,164 +19,202 @@ from stable_baselines3.common.vec_env import (
     DummyVecEnv,
     VecEnv,
     VecEnvWrapper,
-    VecNormalize,
+    unwrap_vec_normalize,
+    unwrap_vec_wrapper,
 )
 
-from scilab_rl.envs.contract import IGNORE, STOP, ContractGuard
-from scilab_rl.envs.frames import FrameCapture
+from scilab_rl.canonical_spaces import with_canonical_spaces
+from scilab_rl.config.classes import build
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.config.workspace import PROJECT_ENVS
+from scilab_rl.envs.frames import simulator_state
 from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.refused_wrappers import refuse_order, refuse_wrapper
 from scilab_rl.envs.registration import resolve_env_id
-from scilab_rl.envs.replayable import ReplayableEpisode
+from scilab_rl.envs.run_env import IGNORE, RunEnv
 from scilab_rl.envs.stability import guard
+from scilab_rl.envs.threads import ThreadsVecEnv
 from scilab_rl.envs.workers import WorkersVecEnv
-from scilab_rl.errors import ConfigError, EnvironmentError_, ScilabRLError, did_you_mean
+from scilab_rl.errors import ConfigError, EnvironmentFailure, ScilabRLError, did_you_mean
 from scilab_rl.machine import n_cores
 from scilab_rl.seeding import derive_seed
+from scilab_rl.space_checks import check_observations
 
 Wrapper = Callable[..., Any]
+_log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class EnvSettings:
-    """How to make an environment; the same for training, evaluation and playing.
+def make_train_env(cfg: RunConfig, render_mode: str | None = None) -> VecEnv:
+    """Make the environments that the algorithm learns in.
 
-    Attributes:
-        env_id: An id that ``gymnasium.make`` knows.
-        env_kwargs: Keyword arguments of the environment.
-        wrappers: Applied in order. A wrapper class of Gymnasium wraps each environment, one of
-            Stable-Baselines3's ``VecEnvWrapper`` the vector of them.
-        n_envs: How many run side by side.
-        vector: ``inprocess``; ``subprocess``, a process each; or ``workers``, one per core, which
-            share them.
-        seed: Seed of the run.
-        modules: Imported first, because they register environments.
+    Args:
+        cfg: The configuration of the run.
         render_mode: ``rgb_array`` or ``human`` when frames are wanted.
-        fast_fetch: Whether Fetch goes without its look-ups by name; the observations are the same.
-        on_nan: ``stop``, ``end_episode`` or ``ignore``, see `contract.ContractGuard`.
     """
-
-    env_id: str
-    env_kwargs: Mapping[str, Any] = field(default_factory=dict)
-    wrappers: Sequence[Wrapper] = ()
-    n_envs: int = 1
-    vector: str = "inprocess"
-    seed: int = 1
-    modules: Sequence[str] = ()
-    render_mode: str | None = None
-    fast_fetch: bool = True
-    on_nan: str = STOP
+    return _make(cfg, "train", render_mode)
 
 
-def make_train_env(settings: EnvSettings) -> VecEnv:
-    """Make the environments that the algorithm learns in."""
-    return _make(settings, "train")
-
-
-def make_eval_env(settings: EnvSettings) -> VecEnv:
+def make_eval_env(cfg: RunConfig, render_mode: str | None = None) -> VecEnv:
     """Make the single environment for evaluation, with its own stream of seeds."""
-    env = _make(replace(settings, n_envs=1, vector="inprocess"), "eval")
-    layer: Any = env
-    while hasattr(layer, "venv"):
-        if isinstance(layer, VecNormalize):  # measure, don't adapt; true rewards
-            layer.training = False
-            layer.norm_reward = False
-        layer = layer.venv
+    # What only changes rewards, to learn better, does not change what is measured.
+    wrappers = [wrapper for wrapper in _wrappers(cfg) if not _is_a(wrapper, gym.RewardWrapper)]
+    cfg = replace(cfg, n_envs=1, vector="inprocess", wrappers=wrappers)
+    env = _make(cfg, "eval", render_mode)
+    if (normalization := unwrap_vec_normalize(env)) is not None:
+        normalization.training = normalization.norm_reward = False  # measure, don't adapt
     return env
 
 
-def make_single_env(settings: EnvSettings, *, in_worker: bool = False) -> gym.Env:
+def make_single_env(
+    cfg: RunConfig, render_mode: str | None = None, *, in_worker: bool = False
+) -> gym.Env:
     """Make one environment with its per-environment wrappers; also called in worker processes."""
-    for module in settings.modules:
-        importlib.import_module(module)
-    resolve_env_id(settings.env_id)  # registers its suite
+    resolve_env_id(cfg.env)  # registers its suite
     try:
-        # An environment that draws nothing need not have the parameter.
-        rendering = {"render_mode": settings.render_mode} if settings.render_mode else {}
-        env = gym.make(settings.env_id, **(rendering | dict(settings.env_kwargs)))
-        env = guard(env)
-        if settings.fast_fetch and "gymnasium_robotics" in sys.modules:
-            from scilab_rl.envs.fast_fetch import speed_up  # brings MuJoCo with it
+        env = guard(_registered_env(cfg, render_mode))
+        if cfg.fast_fetch and "gymnasium_robotics" in sys.modules:
+            from scilab_rl.envs.fast_fetch import speed_up  # imports MuJoCo
 
             speed_up(env)
-        for wrapper in settings.wrappers:
+        for wrapper in _wrappers(cfg):
             if not _wraps_vectors(wrapper):
                 env = wrapper(env)
-        if settings.render_mode == "rgb_array":
-            env = FrameCapture(env)
     except ScilabRLError:
         raise
     except TypeError as error:
-        raise ConfigError(_explain_type_error(settings, error)) from error
+        raise ConfigError(_explain_type_error(cfg, error)) from error
     except Exception as error:
-        raise EnvironmentError_(
-            f"{settings.env_id} cannot be made: {type(error).__name__}: {error}"
+        raise EnvironmentFailure(
+            f"{cfg.env} cannot be made: {type(error).__name__}: {error}"
         ) from error
-    return ReplayableEpisode(ContractGuard(env, settings.on_nan, in_worker=in_worker))
+    return RunEnv(env, cfg.on_nan, in_worker=in_worker)
 
 
-def _make_in_worker(settings: EnvSettings) -> gym.Env:
+def _registered_env(cfg: RunConfig, render_mode: str | None) -> gym.Env:
+    """Make the environment; one that does not know our way of drawing is made without it."""
+    rendering = {"render_mode": render_mode} if render_mode else {}
+    try:
+        return gym.make(cfg.env, **(rendering | dict(cfg.env_kwargs)))
+    except Exception:
+        if render_mode != "rgb_array":
+            raise
+    return gym.make(cfg.env, **cfg.env_kwargs)
+
+
+def _make_in_worker(cfg: RunConfig, render_mode: str | None, modules: Sequence[str]) -> gym.Env:
     # Ctrl-C on the terminal reaches all processes; the main one says when it is time to end.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    return make_single_env(settings, in_worker=True)
+    for module in modules:  # they register environments
+        importlib.import_module(module)
+    return _make_readable(cfg, render_mode, in_worker=True)
+
+
+def _make_readable(cfg: RunConfig, render_mode: str | None, *, in_worker: bool = False) -> gym.Env:
+    env = make_single_env(cfg, render_mode, in_worker=in_worker)
+    check_observations(cfg.env, env.observation_space)
+    return env
+
+
+def _make_in_thread(cfg: RunConfig, render_mode: str | None) -> gym.Env:
+    env = _make_readable(cfg, render_mode)
+    if simulator_state(env) is None:
+        raise ConfigError(
+            f"vector=threads is for environments that are simulated by MuJoCo, and {cfg.env} is "
+            "not. Use vector=workers or vector=inprocess."
+        )
+    return env
 
 
 def observed_layer(env: VecEnv) -> ObservedVecEnv:
     """Return the layer of a vector environment that shows its steps."""
-    layer: Any = env
-    while not isinstance(layer, ObservedVecEnv):
-        layer = layer.venv
+    layer = unwrap_vec_wrapper(env, ObservedVecEnv)
+    assert layer is not None  # `make_train_env` and `make_eval_env` add it
     return layer
 
 
-def _make(settings: EnvSettings, phase: str) -> VecEnv:
-    env: VecEnv
-    n_workers = _n_workers(settings)
-    if n_workers:
-        env = WorkersVecEnv(
-            [partial(_make_in_worker, settings)] * settings.n_envs,
-            n_workers,
-            start_method=os.environ.get("SCILAB_RL_START_METHOD"),
-        )
-    else:
-        env = DummyVecEnv([partial(make_single_env, settings)] * settings.n_envs)
-    env = ObservedVecEnv(
-        env, phase, settings.env_id, seed=settings.seed, allows_nan=settings.on_nan == IGNORE
-    )
-    for wrapper in settings.wrappers:
+def _make(cfg: RunConfig, phase: str, render_mode: str | None) -> VecEnv:
+    wrappers = _wrappers(cfg)
+    for wrapper in wrappers:
+        refuse_wrapper(wrapper)
+    refuse_order(wrappers)
+    env = _make_vector(cfg, render_mode)
+    env = ObservedVecEnv(env, phase, cfg.env, seed=cfg.seed, allows_nan=cfg.on_nan == IGNORE)
+    env = with_canonical_spaces(env)
+    for wrapper in wrappers:
         if _wraps_vectors(wrapper):
             env = wrapper(env)
-    env.seed(derive_seed(settings.seed, phase))
+    env.seed(derive_seed(cfg.seed, phase))
+    if wrappers and phase == "train":
+        _tell_unknown_memory(env)
+        _tell_unshared_memory(wrappers)
     return env
 
 
-def _n_workers(settings: EnvSettings) -> int:
-    """Return how many processes share the environments; 0: the main process has them."""
-    if settings.vector == "inprocess" or settings.n_envs == 1:
-        return 0
-    if settings.vector == "subprocess":
-        return settings.n_envs
-    return min(settings.n_envs, n_cores())
+def _make_vector(cfg: RunConfig, render_mode: str | None) -> VecEnv:
+    """Make the environments, side by side as the configuration says."""
+    n_cpu = min(cfg.n_envs, n_cores())
+    if cfg.vector == "inprocess" or cfg.n_envs == 1:
+        return DummyVecEnv([partial(_make_readable, cfg, render_mode)] * cfg.n_envs)
+    if cfg.vector == "threads":
+        return ThreadsVecEnv([partial(_make_in_thread, cfg, render_mode)] * cfg.n_envs, n_cpu)
+    modules = [PROJECT_ENVS] if PROJECT_ENVS in sys.modules else []
+    return WorkersVecEnv(
+        [partial(_make_in_worker, cfg, render_mode, modules)] * cfg.n_envs,
+        cfg.n_envs if cfg.vector == "subprocess" else n_cpu,
+        start_method=os.environ.get("SCILAB_RL_START_METHOD"),
+    )
+
+
+def _tell_unshared_memory(wrappers: Sequence[Wrapper]) -> None:
+    targets = [getattr(w, "func", w) for w in wrappers if _wraps_vectors(w)]
+    own = [t for t in targets if not t.__module__.startswith(("stable_baselines3", "scilab_"))]
+    if own:
+        _log.warning(
+            "The state of %s is in checkpoints, but neither in policies nor in the evaluation, "
+            "which begin without it. That of a gymnasium.Wrapper is shared and saved.",
+            ", ".join(target.__name__ for target in own),
+        )
+
+
+def _tell_unknown_memory(env: VecEnv) -> None:
+    unknown = env.env_method("unknown_memory", indices=0)[0]
+    if unknown:
+        _log.warning(
+            "The wrappers have attributes that cannot be saved: %s. If they change while training, "
+            "a resumed or played run differs. Numbers, text, arrays and containers of them are "
+            "saved.",
+            ", ".join(unknown),
+        )
+
+
+def _wrappers(cfg: RunConfig) -> list[Wrapper]:
+    """Return the wrappers, each as a function of what it wraps."""
+    return [w if callable(w) else build(w, "wrappers", is_partial=True) for w in cfg.wrappers]
 
 
 def _wraps_vectors(wrapper: Wrapper) -> bool:
+    return _is_a(wrapper, VecEnvWrapper)
+
+
+def _is_a(wrapper: Wrapper, base: type) -> bool:
     target = getattr(wrapper, "func", wrapper)
-    return inspect.isclass(target) and issubclass(target, VecEnvWrapper)
+    return inspect.isclass(target) and issubclass(target, base)
 
 
-def _explain_type_error(settings: EnvSettings, error: TypeError) -> str:
+def _explain_type_error(cfg: RunConfig, error: TypeError) -> str:
     """Name the unknown keyword argument, when that is what the error is about."""
-    for name in settings.env_kwargs:
+    for name in cfg.env_kwargs:
         if f"'{name}'" in str(error):
-            allowed = _keyword_arguments(settings.env_id)
+            allowed = _keyword_arguments(cfg.env)
             return (
-                f"{settings.env_id} takes no env_kwargs.{name}.{did_you_mean(name, allowed)} "
+                f"{cfg.env} takes no env_kwargs.{name}.{did_you_mean(name, allowed)} "
                 f"It takes: {', '.join(allowed) or 'none'}."
             )
-    return f"{settings.env_id} cannot be made with these env_kwargs and wrappers: {error}."
+    return f"{cfg.env} cannot be made with these env_kwargs and wrappers: {error}."
 
 
 def _keyword_arguments(env_id: str) -> list[str]:
-    entry_point: Any = gym.spec(env_id).entry_point
+    entry_point: Any = gym.spec(env_id.rpartition(":")[2]).entry_point
     if isinstance(entry_point, str):
         entry_point = load_env_creator(entry_point)
     parameters: dict[str, None] = {}

@@ -1,10 +1,10 @@
-"""Moments of an episode worth finding again."""
+"""Highlights of an episode."""
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+
+from scilab_rl.metrics.probes import Observation
 
 FALL_METRES = 0.2  # a Fetch block on the floor is 0.4 m lower, a gripper cannot go as deep as 0.2 m
 
@@ -17,7 +17,7 @@ class EpisodeEvents:
         self._succeeded = False
         self._fell = False
 
-    def of_scene(self, observation: Any, success: bool | None) -> list[str]:
+    def of_scene(self, observation: Observation, success: bool | None) -> list[str]:
         """Return the events of a scene.
 
         Args:
@@ -37,7 +37,7 @@ class EpisodeEvents:
         return events
 
 
-def _heights(observation: Any) -> np.ndarray:
+def _heights(observation: Observation) -> np.ndarray:
     """Return the heights of the achieved goal's places in space, if that is what it consists of."""
     if not isinstance(observation, dict) or "achieved_goal" not in observation:
         return np.zeros(0)

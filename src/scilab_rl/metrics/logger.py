@@ -13,6 +13,9 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from scilab_rl.errors import AlgorithmError
+
+TAKEN_NAMES = ("epoch", "step", "kind")  # of the columns that describe a row
 _log = logging.getLogger("scilab_rl.algorithm")
 
 
@@ -27,17 +30,17 @@ class MetricLogger:
     """
 
     def __init__(self) -> None:
-        self.name_to_value: dict[str, Any] = {}
+        self.name_to_value: dict[str, object] = {}
         self._sums: dict[str, float] = defaultdict(float)
-        self._counts: dict[str, int] = defaultdict(int)
+        self._counts: dict[str, float] = defaultdict(float)
         self._watched: frozenset[str] = frozenset()
         self._seen: dict[str, float] = {}
 
-    def record(self, key: str, value: Any, exclude: object = None) -> None:
+    def record(self, key: str, value: object, exclude: object = None) -> None:
         """Record a value; an earlier one of the same epoch is replaced.
 
         Args:
-            key: ``section/name``, for example ``train/critic_variance``.
+            key: ``section/name``, for example ``train/target_critic_variance``.
             value: A number, or a tensor or array with one element.
             exclude: Accepted for Stable-Baselines3, ignored.
         """
@@ -45,12 +48,12 @@ class MetricLogger:
         if key in self._watched:
             self._see(key, value)
 
-    def record_lazy(self, key: str, function: Callable[[], Any]) -> None:
-        """Record a value that is drawn beside the scene and is too expensive for every step.
+    def record_lazy(self, key: str, function: Callable[[], object]) -> None:
+        """Record a value that is shown next to the scene and is too expensive for every step.
 
         Args:
             key: ``section/name``.
-            function: Returns the value; called only while somebody watches this key.
+            function: Returns the value; called only while this key is watched.
         """
         if key in self._watched:
             self._see(key, function())
@@ -79,14 +82,23 @@ class MetricLogger:
         """Return the numbers of this epoch and begin the next one.
 
         What is not a number (text, images, histograms of other frameworks) is left out.
+
+        Raises:
+            AlgorithmError: If a metric has the name of a column that is there anyway.
         """
+        for name in TAKEN_NAMES:
+            if name in self.name_to_value:
+                raise AlgorithmError(
+                    f"The algorithm records '{name}', which is a column of metrics.csv already: "
+                    f"give it a section, as in train/{name}."
+                )
         values = self._numbers()
         self.name_to_value.clear()
         self._sums.clear()
         self._counts.clear()
         return values
 
-    def _see(self, key: str, value: Any) -> None:
+    def _see(self, key: str, value: object) -> None:
         number = as_number(value)
         if number is not None and math.isfinite(number):
             self._seen[key] = number
@@ -98,7 +110,7 @@ class MetricLogger:
             if (number := as_number(value)) is not None
         }
 
-    def state(self) -> dict[str, dict[str, Any]]:
+    def state(self) -> dict[str, dict[str, float]]:
         """Return what was recorded in the unfinished epoch, for a checkpoint."""
         return {
             "values": self._numbers(),
@@ -106,11 +118,11 @@ class MetricLogger:
             "counts": dict(self._counts),
         }
 
-    def set_state(self, state: dict[str, dict[str, Any]]) -> None:
+    def set_state(self, state: dict[str, dict[str, float]]) -> None:
         """Go on with an unfinished epoch."""
         self.name_to_value = dict(state["values"])
         self._sums = defaultdict(float, state["sums"])
-        self._counts = defaultdict(int, state["counts"])
+        self._counts = defaultdict(float, state["counts"])
 
     def dump(self, step: int = 0) -> None:
         """Do nothing: the framework decides when an epoch ends, not the algorithm."""

@@ -1,69 +1,86 @@
-"""Quantities of the agent's inside for one step: what is drawn beside the scene.
+"""Quantities of the agent for one step, which are shown next to the scene.
 
 A probe is a function of the step, and takes as many of these as it needs, in this order::
 
-    (algorithm, observation, action, reward, next_observation, info, done)
+    (algorithm, observation, action, reward, next_observation, info, done, terminated)
 
 It returns a number, several numbers by name, or None where there is nothing to say. Observations
 and actions are those of the environment, without a batch dimension; ``next_observation`` is the
-last one of the episode where ``done`` is true.
+last one of the episode where ``done`` is true, and that one is a terminal state, without a future,
+where ``terminated`` is true.
 
 Write your own in ``src/custom_probes.py`` and give its name to a run:
-``render_metrics_train=[custom_probes.surprise]``. A class is made anew for each episode, so that it
-can remember what has been.
+``render_metrics_train=[custom_probes.surprise]``. A class is instantiated for each episode, so that
+it can keep state.
 """
 
 from __future__ import annotations
 
-import fnmatch
 import importlib
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.metrics.logger import as_number
+from scilab_rl.metrics.names import is_recorded, refuse_absent
 from scilab_rl.metrics.success import success_of
 
 ARGUMENTS = (
-    "algorithm",
-    "observation",
-    "action",
-    "reward",
-    "next_observation",
-    "info",
-    "done",
-)
+    "algorithm", "observation", "action", "reward", "next_observation", "info", "done",
+    "terminated",
+)  # fmt: skip
+SECOND_CRITIC = "second critic"  # a quantity of algorithms with more than one
 _SCENE_ARGUMENTS = 2  # what is known of the last scene of an episode, in which nothing is done
 
 
-class Inspectable(Protocol):
-    """What probes ask about an algorithm; `scilab_rl.algorithms.inspection` answers."""
+Observation = np.ndarray | dict[str, np.ndarray]
 
-    algorithm: Any
+
+class Curve(NamedTuple):
+    """A line in a panel.
+
+    Attributes:
+        panel: The metric.
+        label: Which of its numbers; empty for a metric that is one number.
+    """
+
+    panel: str
+    label: str = ""
+
+
+class Inspectable(Protocol):
+    """The quantities of an algorithm for probes, see `scilab_rl.learning.inspector`."""
+
     quantities: frozenset[str]
+
+    @property
+    def algorithm(self) -> object:
+        """The algorithm."""
 
     @property
     def gamma(self) -> float:
         """The discount factor."""
 
-    def q_values(self, observation: Any, action: Any) -> np.ndarray:
-        """What each critic says about an action. Shapes: result ``(n_critics,)``."""
+    def q_values(self, observation: Observation, action: np.ndarray) -> np.ndarray:
+        """The value of an action for each critic. Shapes: result ``(n_critics,)``."""
 
-    def value(self, observation: Any) -> float:
+    def value(self, observation: Observation) -> float:
         """The value of an observation."""
 
-    def log_prob(self, observation: Any, action: Any) -> float:
+    def log_prob(self, observation: Observation, action: np.ndarray) -> float:
         """The log probability of an action."""
 
-    def entropy(self, observation: Any) -> float:
+    def entropy(self, observation: Observation) -> float:
         """The entropy of the policy, in nats."""
 
-    def intrinsic_reward(self, observation: Any, action: Any, next_observation: Any) -> float:
+    def intrinsic_reward(
+        self, observation: Observation, action: np.ndarray, next_observation: Observation
+    ) -> float:
         """The reward that the algorithm gives itself."""
 
     def learned_reward(self, reward: float) -> float:
@@ -82,7 +99,7 @@ class Probe:
     """
 
     name: str
-    make: Callable[[], Callable[..., Any]]
+    make: Callable[[], Callable[..., object]]
     n_arguments: int
     needs: frozenset[str] = frozenset()
 
@@ -94,7 +111,7 @@ class Probe:
 
 @dataclass(frozen=True)
 class ShownMetrics:
-    """What is shown beside the scene.
+    """The metrics that are shown next to the scene.
 
     Attributes:
         names: One panel each, in the user's order.
@@ -107,60 +124,70 @@ class ShownMetrics:
     recorded: tuple[str, ...] = ()
 
 
-def q_value(mind: Inspectable, observation: Any, action: Any) -> float:
+def q_value(inspector: Inspectable, observation: Observation, action: np.ndarray) -> float:
     """Q(s, a): the mean over the critics."""
-    return float(mind.q_values(observation, action).mean())
+    return float(inspector.q_values(observation, action).mean())
 
 
-def q_values(mind: Inspectable, observation: Any, action: Any) -> dict[str, float]:
+def q_values(
+    inspector: Inspectable, observation: Observation, action: np.ndarray
+) -> dict[str, float]:
     """Q(s, a) of each critic."""
-    return _numbered(mind.q_values(observation, action))
+    return _numbered(inspector.q_values(observation, action))
 
 
-def critic_variance(mind: Inspectable, observation: Any, action: Any) -> float:
-    """How much the critics disagree: the mean squared deviation of Q_i(s, a) from their mean."""
-    return float(np.var(mind.q_values(observation, action).astype(np.float64)))
+def critic_variance(
+    inspector: Inspectable, observation: Observation, action: np.ndarray
+) -> float | None:
+    """How much the critics disagree: the mean squared deviation of Q_i(s, a) from their mean.
+
+    A single critic has no variance.
+    """
+    values = inspector.q_values(observation, action).astype(np.float64)
+    return float(np.var(values)) if len(values) > 1 else None
 
 
-def value(mind: Inspectable, observation: Any) -> float:
+def value(inspector: Inspectable, observation: Observation) -> float:
     """V(s): the value network, or the mean over the critics of Q(s, pi(s))."""
-    return mind.value(observation)
+    return inspector.value(observation)
 
 
 def td_error(
-    mind: Inspectable,
-    observation: Any,
-    action: Any,
+    inspector: Inspectable,
+    observation: Observation,
+    action: np.ndarray,
     reward: float,
-    next_observation: Any,
-    info: Mapping[str, Any],
+    next_observation: Observation,
+    info: Mapping[str, object],
     done: bool,
+    terminated: bool,
 ) -> float:
     """The surprise r + gamma V(s') - Q(s, a), or - V(s) for algorithms without action values.
 
     A terminal state has no value; one where the episode was only cut off (truncated) has.
     """
-    terminated = done and not info.get("TimeLimit.truncated", False)
-    future = 0.0 if terminated else mind.gamma * mind.value(next_observation)
-    if "q_values" in mind.quantities:
-        expected = q_value(mind, observation, action)
+    future = 0.0 if terminated else inspector.gamma * inspector.value(next_observation)
+    if "q_values" in inspector.quantities:
+        expected = q_value(inspector, observation, action)
     else:
-        expected = mind.value(observation)
-    return mind.learned_reward(reward) + future - expected
+        expected = inspector.value(observation)
+    return inspector.learned_reward(reward) + future - expected
 
 
-def entropy(mind: Inspectable, observation: Any) -> float:
+def entropy(inspector: Inspectable, observation: Observation) -> float:
     """H(pi(. | s)) in nats."""
-    return mind.entropy(observation)
+    return inspector.entropy(observation)
 
 
-def log_prob(mind: Inspectable, observation: Any, action: Any) -> float:
+def log_prob(inspector: Inspectable, observation: Observation, action: np.ndarray) -> float:
     """Log pi(a | s) in nats."""
-    return mind.log_prob(observation, action)
+    return inspector.log_prob(observation, action)
 
 
-def reward(mind: Inspectable, observation: Any, action: Any, reward: float) -> float:
-    """What the environment gave for this action."""
+def reward(
+    inspector: Inspectable, observation: Observation, action: np.ndarray, reward: float
+) -> float:
+    """The reward of the environment for this action."""
     return reward + 0.0  # never -0
 
 
@@ -170,37 +197,45 @@ class ReturnSoFar:
     def __init__(self) -> None:
         self.total = 0.0
 
-    def __call__(self, mind: Inspectable, observation: Any, action: Any, reward: float) -> float:
+    def __call__(
+        self, inspector: Inspectable, observation: Observation, action: np.ndarray, reward: float
+    ) -> float:
         """Add a reward."""
         self.total += reward
         return self.total
 
 
 def intrinsic_reward(
-    mind: Inspectable, observation: Any, action: Any, reward: float, next_observation: Any
+    inspector: Inspectable,
+    observation: Observation,
+    action: np.ndarray,
+    reward: float,
+    next_observation: Observation,
 ) -> float:
-    """What the algorithm gave itself for this action."""
-    return mind.intrinsic_reward(observation, action, next_observation)
+    """The intrinsic reward for this action."""
+    return inspector.intrinsic_reward(observation, action, next_observation)
 
 
-def goal_distance(mind: Inspectable, observation: Any) -> float:
+def goal_distance(inspector: Inspectable, observation: Observation) -> float:
     """The Euclidean distance of the achieved goal from the desired one, in the task's units."""
     return float(np.linalg.norm(observation["achieved_goal"] - observation["desired_goal"]))
 
 
-def action(mind: Inspectable, observation: Any, action: Any) -> dict[str, float] | float:
+def action(
+    inspector: Inspectable, observation: Observation, action: np.ndarray
+) -> dict[str, float] | float:
     """Each dimension of the action."""
     values = np.asarray(action, dtype=np.float64).ravel()
     return _numbered(values) if np.ndim(action) else float(values[0])
 
 
 def success(
-    mind: Inspectable,
-    observation: Any,
-    action: Any,
+    inspector: Inspectable,
+    observation: Observation,
+    action: np.ndarray,
     reward: float,
-    next_observation: Any,
-    info: Mapping[str, Any],
+    next_observation: Observation,
+    info: Mapping[str, object],
 ) -> float | None:
     """1 when the action led to success, 0 when not."""
     reached = success_of(info)
@@ -208,10 +243,10 @@ def success(
 
 
 # name -> (function or class, quantities that the algorithm must answer)
-_PROBES: dict[str, tuple[Callable[..., Any], frozenset[str]]] = {
+_PROBES: dict[str, tuple[Callable[..., object], frozenset[str]]] = {
     "q_value": (q_value, frozenset({"q_values"})),
     "q_values": (q_values, frozenset({"q_values"})),
-    "critic_variance": (critic_variance, frozenset({"q_values"})),
+    "critic_variance": (critic_variance, frozenset({"q_values", SECOND_CRITIC})),
     "value": (value, frozenset({"value"})),
     "td_error": (td_error, frozenset({"value"})),
     "entropy": (entropy, frozenset({"entropy"})),
@@ -235,26 +270,35 @@ def built_in(name: str) -> Probe:
 
 
 def is_known(name: str) -> bool:
-    """Tell whether this is the name of a built-in probe."""
+    """Return whether this is the name of a built-in probe."""
     return name in _PROBES or name in _ALIASES
 
 
-def answerable(mind: Inspectable) -> list[str]:
+def answerable(inspector: Inspectable) -> list[str]:
     """Return the names of the probes that an algorithm can answer."""
-    return [name for name, (_, needs) in _PROBES.items() if needs <= mind.quantities]
+    return [name for name, (_, needs) in _PROBES.items() if needs <= inspector.quantities]
 
 
 def resolve_metrics(
-    names: Sequence[str], mind: Inspectable, recorded: Iterable[str], *, key: str, who: str
+    names: Sequence[str],
+    inspector: Inspectable,
+    recorded: Iterable[str],
+    *,
+    key: str,
+    algorithm_name: str,
+    absent: Mapping[str, str] | None = None,
+    hint: Callable[[str], str] = lambda name: "",
 ) -> ShownMetrics:
     """Find out how each metric of a ``render_metrics_*`` list is obtained.
 
     Args:
         names: Probes, ``module.function`` of the user, and names that the algorithm records.
-        mind: The algorithm.
+        inspector: The algorithm.
         recorded: Names that the algorithm is known to record, or patterns such as ``train/*``.
         key: The key of the list, for messages.
-        who: The algorithm's name, for messages.
+        algorithm_name: The algorithm's name, for messages.
+        absent: Names that it records in other configurations, and in which.
+        hint: Returns what else can be done about an unknown name.
 
     Raises:
         ConfigError: If a name is unknown or the algorithm cannot answer a probe.
@@ -265,18 +309,20 @@ def resolve_metrics(
     for name in dict.fromkeys(names):
         if is_known(name):
             probe = built_in(name)
-            _check_answerable(probe, mind, key, who)
+            _check_answerable(probe, inspector, key, algorithm_name)
             probes.append(probe)
         elif "." in name and "/" not in name:
             probes.append(_custom(name, key))
-        elif any(fnmatch.fnmatchcase(name, pattern) for pattern in known):
+        elif is_recorded(name, known):
             logged.append(name)
         else:
+            refuse_absent(key, name, absent or {}, algorithm_name)
             words = [*_PROBES, *_ALIASES, *(word for word in known if "*" not in word)]
             raise ConfigError(
-                f"{key}: there is no metric '{name}'.{did_you_mean(name, words)} Probes of {who}: "
-                f"{', '.join(answerable(mind))}. It records: {listing(known) or 'nothing'}. "
-                "Your own: custom_probes.FUNCTION."
+                f"{key}: there is no metric '{name}'.{did_you_mean(name, words)} "
+                f"Probes of {algorithm_name}: "
+                f"{', '.join(answerable(inspector))}. It records: {listing(known) or 'nothing'}. "
+                f"Your own: custom_probes.FUNCTION.{hint(name)}"
             )
     return ShownMetrics(tuple(dict.fromkeys(names)), tuple(probes), tuple(logged))
 
@@ -288,30 +334,30 @@ class EpisodeProbes:
     A probe that fails is reported once by ``warn`` and is then a gap.
     """
 
-    mind: Inspectable
+    inspector: Inspectable
     probes: Iterable[Probe]
     warn: Callable[[str], object]
-    _functions: list[tuple[Probe, Callable[..., Any]]] = field(init=False)
+    _functions: list[tuple[Probe, Callable[..., object]]] = field(init=False)
 
     def __post_init__(self) -> None:
         self._functions = [(probe, probe.make()) for probe in self.probes]
 
-    def of_step(self, *arguments: Any) -> dict[str, float]:
+    def of_step(self, *arguments: object) -> dict[Curve, float]:
         """Return the values of a step, given what follows the algorithm in `ARGUMENTS`."""
         return self._values(self._functions, arguments)
 
-    def of_scene(self, observation: Any) -> dict[str, float]:
+    def of_scene(self, observation: Observation) -> dict[Curve, float]:
         """Return what can be said of the last scene, in which nothing is done any more."""
         functions = [entry for entry in self._functions if entry[0].describes_scene]
         return self._values(functions, (observation,))
 
     def _values(
-        self, functions: list[tuple[Probe, Callable[..., Any]]], arguments: tuple[Any, ...]
-    ) -> dict[str, float]:
-        values: dict[str, float] = {}
+        self, functions: list[tuple[Probe, Callable[..., object]]], arguments: tuple[object, ...]
+    ) -> dict[Curve, float]:
+        values: dict[Curve, float] = {}
         for probe, function in functions:
             try:
-                answer = function(self.mind, *arguments[: probe.n_arguments - 1])
+                answer = function(self.inspector, *arguments[: probe.n_arguments - 1])
                 values |= as_curves(probe.name, answer)
             except Exception as error:  # noqa: BLE001 - a user's probe must not end the training
                 self.warn(f"The metric {probe.name} failed: {type(error).__name__}: {error}")
@@ -319,38 +365,35 @@ class EpisodeProbes:
         return values
 
 
-def as_curves(name: str, answer: Any) -> dict[str, float]:
-    """Return the numbers of an answer by the names of their curves; what is not finite is a gap.
+def as_curves(name: str, answer: object) -> dict[Curve, float]:
+    """Return the numbers of an answer by their curves; what is not finite is a gap.
 
     >>> as_curves("q_values", {"0": 1.5, "1": float("nan")})
-    {'q_values[0]': 1.5}
+    {Curve(panel='q_values', label='0'): 1.5}
     >>> as_curves("success", None)
     {}
     """
-    if isinstance(answer, Mapping):
-        named = {f"{name}[{label}]": as_number(number) for label, number in answer.items()}
-    else:
-        named = {name: as_number(answer)}
+    numbers = answer if isinstance(answer, Mapping) else {"": answer}
     return {
-        curve: number
-        for curve, number in named.items()
-        if number is not None and math.isfinite(number)
+        Curve(name, str(label)): number
+        for label, value in numbers.items()
+        if (number := as_number(value)) is not None and math.isfinite(number)
     }
 
 
-def _numbered(values: Iterable[Any]) -> dict[str, float]:
+def _numbered(values: Iterable[float]) -> dict[str, float]:
     return {str(index): float(number) for index, number in enumerate(values)}
 
 
-def _maker(function: Callable[..., Any]) -> Callable[[], Callable[..., Any]]:
-    """Return how to get the function for an episode: a class is made anew for each."""
+def _maker(function: Callable[..., object]) -> Callable[[], Callable[..., object]]:
+    """Return how to get the function for an episode: a class is instantiated for each."""
     if inspect.isclass(function):
         made: Callable[[], Any] = function
         return made
     return lambda: function
 
 
-def _n_arguments(function: Callable[..., Any]) -> int:
+def _n_arguments(function: Callable[..., object]) -> int:
     is_class = inspect.isclass(function)
     called = vars(function)["__call__"] if is_class else function
     parameters = list(inspect.signature(called).parameters.values())[is_class:]
@@ -359,12 +402,15 @@ def _n_arguments(function: Callable[..., Any]) -> int:
     return len([p for p in parameters if p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)])
 
 
-def _check_answerable(probe: Probe, mind: Inspectable, key: str, who: str) -> None:
-    missing = probe.needs - mind.quantities
+def _check_answerable(probe: Probe, inspector: Inspectable, key: str, algorithm_name: str) -> None:
+    missing = probe.needs - inspector.quantities
+    if missing and (reason := getattr(inspector, "reason", "")):
+        raise ConfigError(f"{key}: '{probe.name}' cannot be asked here. {reason}")
     if missing:
         raise ConfigError(
-            f"{key}: {who} cannot answer '{probe.name}', because it has no {listing(missing)} "
-            f"here. It can answer: {', '.join(answerable(mind))}."
+            f"{key}: {algorithm_name} cannot answer '{probe.name}', because it has no "
+            f"{listing(missing)} here. It can answer: {', '.join(answerable(inspector))}."
+            + (" Give it two critics or more (n_critics)." * (missing == {SECOND_CRITIC}))
         )
 
 
@@ -394,8 +440,8 @@ def _custom(name: str, key: str) -> Probe:
 
     make = _maker(own)
 
-    def make_for_algorithm() -> Callable[..., Any]:
+    def make_for_algorithm() -> Callable[..., object]:
         function = make()
-        return lambda mind, *rest: function(mind.algorithm, *rest)
+        return lambda inspector, *rest: function(inspector.algorithm, *rest)
 
     return Probe(name, make_for_algorithm, n_arguments)

@@ -43,7 +43,3 @@ class MetricStore:
         """Return the newest value of a metric, or None when it was never recorded."""
         series = self.series(name)
         return series[-1] if series else None
-
-    def names(self) -> list[str]:
-        """Return the names of all metrics seen so far, in order of appearance."""
-        return list(dict.fromkeys(name for row in self.rows for name in row))

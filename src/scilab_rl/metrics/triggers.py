@@ -1,4 +1,4 @@
-"""When to keep a moment: ``critic_variance > p99``, ``success``, ``custom_probes.surprise > 0``."""
+"""When to keep a scene: ``critic_variance > p99``, ``success``, ``custom_probes.surprise > 0``."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scilab_rl.errors import ConfigError, did_you_mean
+from scilab_rl.metrics.probes import Curve
 
 EVENTS = ("success", "success lost", "object fell")
 _COMPARISON = re.compile(
@@ -35,7 +36,7 @@ class Trigger:
     is_percentile: bool = False
 
     def score(
-        self, values: Mapping[str, float], events: Iterable[str], seen: np.ndarray
+        self, values: Mapping[Curve, float], events: Iterable[str], seen: np.ndarray
     ) -> float | None:
         """Return how strongly a scene meets the condition, or None when it does not.
 
@@ -46,10 +47,10 @@ class Trigger:
         """
         if self.metric is None:
             return 1.0 if self.text in events else None
-        if self.metric not in values or not len(seen):
+        if Curve(self.metric) not in values or not len(seen):
             return None
         limit = float(np.percentile(seen, self.limit)) if self.is_percentile else self.limit
-        excess = values[self.metric] - limit
+        excess = values[Curve(self.metric)] - limit
         excess = excess if self.sign == ">" else -excess
         return excess if excess > 0 else None
 
@@ -75,7 +76,7 @@ def parse_trigger(text: str) -> Trigger:
             raise ValueError
     except ValueError:
         raise ConfigError(
-            f"record_when: '{text}' is no condition.{did_you_mean(text, EVENTS)} Write "
+            f"record_when: '{text}' is not a condition.{did_you_mean(text, EVENTS)} Write "
             f"'METRIC > NUMBER', 'METRIC > p99' (percentile), or one of: {', '.join(EVENTS)}."
         ) from None
     return Trigger(text, found["metric"], found["sign"], number, limit.startswith("p"))

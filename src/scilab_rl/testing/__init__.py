@@ -1,7 +1,8 @@
-"""What it takes to test an algorithm: tiny environments, and an exam that any algorithm can take.
+"""Tools to test an algorithm: tiny environments, and a contract test for any algorithm.
 
 Importing this package registers the environments, so that they can be made from the command line
-too: ``env=scilab_rl.testing:TinyReach-v0``. The exam is in ``scilab_rl.testing.algorithms``.
+too: ``env=scilab_rl.testing:TinyReach-v0``. The contract test is in
+    ``scilab_rl.testing.algorithms``.
 """
 
 from scilab_rl.testing.environments import TINY_ENVIRONMENTS, decode_frame, register

@@ -1,4 +1,4 @@
-"""The exam that every algorithm takes.
+"""The contract test of every algorithm.
 
 An algorithm of your own takes it with three lines in a test file:
 
@@ -9,37 +9,46 @@ An algorithm of your own takes it with three lines in a test file:
     class TestMyIdea(AlgorithmContract):
         algorithm = "my_idea"  # conf/algorithm/my_idea.yaml
 
-It runs in an environment of a few microseconds per step, with small networks and batches.
+It runs in an environment of a few microseconds per step, with small networks and batches. The
+environment variable ``SCILAB_RL_TEST_DEVICE=cuda`` moves it from the CPU to a GPU.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 import gc
 import inspect
 import math
-from collections.abc import Mapping
+import os
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
-import hydra
 import numpy as np
 import pytest
-from omegaconf import DictConfig, OmegaConf
 from stable_baselines3.common.callbacks import BaseCallback
 
-from scilab_rl import assembly, config
-from scilab_rl.algorithms.arguments import FRAMEWORK_PARAMETERS, allowed_arguments
-from scilab_rl.algorithms.compatibility import check_pair
+from scilab_rl.config.classes import find_target
+from scilab_rl.config.compose import compose
+from scilab_rl.config.schema import AlgorithmConfig, RunConfig
+from scilab_rl.config.workspace import open_project
 from scilab_rl.envs.registration import resolve_env_id
-from scilab_rl.envs.vectorize import EnvSettings, make_single_env, make_train_env, observed_layer
+from scilab_rl.envs.vec_step import Observation
+from scilab_rl.envs.vectorize import make_single_env, make_train_env, observed_layer
 from scilab_rl.errors import ConfigError
+from scilab_rl.learning.algorithm import Algorithm
+from scilab_rl.learning.arguments import FRAMEWORK_PARAMETERS, allowed_arguments
+from scilab_rl.learning.compatibility import check_pair
+from scilab_rl.learning.declared import declared_metrics, differences
 from scilab_rl.metrics.logger import MetricLogger, as_number
+from scilab_rl.run.checks import prepare_torch
+from scilab_rl.run.parts import make_algorithm
 from scilab_rl.training import checkpoint
+from scilab_rl.training.policy import load_policy, policy_state
 from scilab_rl.training.snapshot import capture, random_state, restore, set_random_state
-from scilab_rl.training.trainer import load_policy, policy_state
-from scilab_rl.workspace import open_desk
 
+DEVICE_VARIABLE = "SCILAB_RL_TEST_DEVICE"
 # In the order of preference: the first one whose spaces the algorithm takes.
 _WITHOUT_GOALS = ("scilab_rl.testing:TinyBox-v0", "scilab_rl.testing:TinyDiscrete-v0")
 _CANDIDATES = (
@@ -55,7 +64,7 @@ _PLUMBING = {
     "rollout_buffer_kwargs",
     "stats_window_size",
 }
-# Upper limits that keep the exam short; used for those parameters that an algorithm has.
+# Upper limits that keep the contract test short; used for those parameters that an algorithm has.
 _SMALL_NUMBERS = {
     "batch_size": 16,
     "buffer_size": 2000,
@@ -75,19 +84,20 @@ class AlgorithmContract:
 
     Attributes:
         algorithm: Name of a YAML in an ``algorithm/`` folder, or an algorithm's class.
-        arguments: Keyword arguments that win over the YAML and over the small values of the exam.
+        arguments: Keyword arguments that win over the YAML and over the small values of the
+            contract test.
         env: Id of an environment; None picks a tiny one that fits the algorithm.
     """
 
     algorithm: str | type
-    arguments: Mapping[str, Any] = {}
+    arguments: Mapping[str, object] = {}
     env: str | None = None
 
     def test_yaml_lists_the_constructors_parameters(self) -> None:
         """A reader of the YAML sees every parameter, and nothing that does not exist."""
         if not isinstance(self.algorithm, str):
             pytest.skip("a class without YAML")
-        cls, given = self._class(), set(_composed(self.algorithm)) - {"name", "_target_"}
+        cls, given = self._class(), set(_composed(self.algorithm).arguments)
         wanted = set(allowed_arguments(cls))
         assert given <= wanted, f"no parameters of {cls.__name__}: {sorted(given - wanted)}"
         missing = wanted - given - _PLUMBING - set(FRAMEWORK_PARAMETERS)
@@ -155,11 +165,22 @@ class AlgorithmContract:
 
     def test_records_finite_metrics(self) -> None:
         """Whatever learns says how: at least one ``train/`` metric, and each a finite number."""
-        model = self.trained()
-        recorded = {key: as_number(value) for key, value in model.logger.name_to_value.items()}
+        model, logger = self.build(), MetricLogger()
+        model.set_logger(logger)
+        model.learn(_N_STEPS, callback=_Recorder(), log_interval=None)
+        recorded = {key: as_number(value) for key, value in logger.name_to_value.items()}
         numbers = {key: value for key, value in recorded.items() if value is not None}
         assert [key for key, value in numbers.items() if not math.isfinite(value)] == []
         assert not _learns(model) or any(key.startswith("train/") for key in numbers)
+
+    def test_records_what_it_declares(self) -> None:
+        """A misspelled metric can be refused at the start, because the class names its own."""
+        model, logger = self.build(), _NamingLogger()
+        model.set_logger(logger)
+        model.learn(_N_STEPS, callback=_Recorder(), log_interval=None)
+        intrinsic = {metric.name for metric in declared_metrics(type(_intrinsic_of(model)))}
+        lines = differences(model, logger.names - intrinsic)
+        assert not lines, "\n".join(lines)
 
     def test_predict_has_the_usual_signature(self) -> None:
         """As in Stable-Baselines3: one observation or several, actions within the action space."""
@@ -170,7 +191,7 @@ class AlgorithmContract:
         observations = self._observations(n_envs=3)
         actions, state = model.predict(observations, deterministic=True)
         assert state is None or isinstance(state, tuple)
-        assert np.shape(actions) == (3, *space.shape)
+        assert np.shape(actions) == (3, *(space.shape or ()))
         one = _map(observations, lambda values: values[0])
         for deterministic in (True, False):
             action = np.asarray(model.predict(one, deterministic=deterministic)[0])
@@ -213,42 +234,43 @@ class AlgorithmContract:
         gc.collect()
         assert process.memory_info().rss - before < _ALLOWED_GROWTH_BYTES
 
-    def build(self, *, n_envs: int = 1, seed: int = _SEED) -> Any:
+    def build(self, *, n_envs: int = 1, seed: int = _SEED) -> Algorithm:
         """Build the algorithm as a run does, with small networks and batches."""
         cfg = self._configuration(n_envs, seed)
-        assembly.prepare_torch(cfg)
-        model = assembly.make_algorithm(cfg, make_train_env(assembly.env_settings(cfg)))
+        prepare_torch(cfg)
+        model = make_algorithm(cfg, make_train_env(cfg))
         model.set_logger(MetricLogger())
         return model
 
-    def trained(self, *, n_envs: int = 1, seed: int = _SEED) -> Any:
+    def trained(self, *, n_envs: int = 1, seed: int = _SEED) -> Algorithm:
         """Build the algorithm and let it learn for 200 steps."""
         model = self.build(n_envs=n_envs, seed=seed)
         model.learn(_N_STEPS, callback=_Recorder(), log_interval=None)
         return model
 
-    def _configuration(self, n_envs: int, seed: int) -> DictConfig:
-        cls, cfg = self._class(), _composed_run().copy()
-        cfg.env = resolve_env_id(self.env or fitting_environment(cls))[0]
-        cfg.n_envs, cfg.seed = n_envs, seed
-        given = _composed(self.algorithm) if isinstance(self.algorithm, str) else {}
-        cfg.algorithm = {
-            "name": cls.__name__,
-            "_target_": f"{cls.__module__}.{cls.__qualname__}",
-            **given,
-            **_small(cls, given),
-            **self.arguments,
-        }
-        return cfg
+    def _configuration(self, n_envs: int, seed: int) -> RunConfig:
+        cls = self._class()
+        algorithm = AlgorithmConfig(cls.__name__, f"{cls.__module__}.{cls.__qualname__}")
+        if isinstance(self.algorithm, str):
+            algorithm = _composed(self.algorithm)
+        given = algorithm.arguments
+        arguments = {**given, **_small(cls, given), **self.arguments}
+        return RunConfig(
+            env=resolve_env_id(self.env or fitting_environment(cls))[0],
+            n_envs=n_envs,
+            seed=seed,
+            device=os.environ.get(DEVICE_VARIABLE, "cpu"),
+            algorithm=dataclasses.replace(algorithm, arguments=arguments),
+        )
 
     def _class(self) -> type:
         if isinstance(self.algorithm, type):
             return self.algorithm
-        return hydra.utils.get_class(_composed(self.algorithm)["_target_"])
+        cls: type = find_target(_composed(self.algorithm).target, "algorithm._target_")
+        return cls
 
-    def _observations(self, n_envs: int = 1) -> Any:
-        settings = assembly.env_settings(self._configuration(n_envs, _SEED + 2))
-        return make_train_env(settings).reset()
+    def _observations(self, n_envs: int = 1) -> Observation:
+        return make_train_env(self._configuration(n_envs, _SEED + 2)).reset()  # type: ignore[return-value]
 
 
 def fitting_environment(cls: type, *, with_goals: bool = True) -> str:
@@ -263,12 +285,36 @@ def fitting_environment(cls: type, *, with_goals: bool = True) -> str:
     """
     for env_id in _CANDIDATES if with_goals else _WITHOUT_GOALS:
         try:
-            check_pair(cls.__name__, cls, env_id, make_single_env(EnvSettings(env_id)))
+            check_pair(cls.__name__, cls, env_id, make_single_env(RunConfig(env_id)))
         except ConfigError as error:
             refusal = error
             continue
         return env_id
     raise refusal
+
+
+class _NamingLogger(MetricLogger):
+    """Collects the names that an algorithm records, also those that are not watched."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.names: set[str] = set()
+
+    def record(self, key: str, value: object, exclude: object = None) -> None:
+        self.names.add(key)
+        super().record(key, value)
+
+    def record_mean(self, key: str, value: float | None, exclude: object = None) -> None:
+        self.names.add(key)
+        super().record_mean(key, value)
+
+    def record_lazy(self, key: str, function: Callable[[], object]) -> None:
+        self.names.add(key)
+        super().record_lazy(key, function)
+
+
+def _intrinsic_of(model: Algorithm) -> object:
+    return getattr(model, "intrinsic", None)
 
 
 class _Recorder(BaseCallback):
@@ -292,9 +338,9 @@ class _Recorder(BaseCallback):
 
 
 class _Interruption(BaseCallback):
-    """Saves everything at the first rollout that begins after some steps, and goes on."""
+    """Saves everything at the first rollout that begins after some steps, and continues."""
 
-    def __init__(self, model: Any, directory: Path, after_n_steps: int) -> None:
+    def __init__(self, model: Algorithm, directory: Path, after_n_steps: int) -> None:
         super().__init__()
         self.algorithm = model
         self.directory = directory
@@ -317,7 +363,7 @@ class _Interruption(BaseCallback):
         }
         checkpoint.save(capture(state), self.directory, step=self.step)
 
-    def resume(self, model: Any) -> None:
+    def resume(self, model: Algorithm) -> None:
         """Bring a freshly built algorithm and its environments to the saved place."""
         rebuilt = {"algorithm": model, "environments": None, "observed": None, "random": None}
         saved = restore(rebuilt, checkpoint.load(self.directory))
@@ -329,26 +375,18 @@ class _Interruption(BaseCallback):
 
 
 @functools.cache
-def _composed_run() -> DictConfig:
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        return config.compose(["tuned=false", "device=cpu", "n_threads=1"])
+def _composed(algorithm: str) -> AlgorithmConfig:
+    open_project()
+    return compose([f"algorithm={algorithm}", "tuned=false"]).algorithm
 
 
-@functools.cache
-def _composed(algorithm: str) -> dict[str, Any]:
-    open_desk()
-    with hydra.initialize_config_module("scilab_rl.conf", version_base="1.3"):
-        cfg = config.compose([f"algorithm={algorithm}", "tuned=false"])
-    return OmegaConf.to_container(cfg.algorithm, resolve=True)  # type: ignore[return-value]
-
-
-def _small(cls: type, given: Mapping[str, Any]) -> dict[str, Any]:
+def _small(cls: type, given: Mapping[str, Any]) -> dict[str, object]:
     """Return smaller values for those parameters of an algorithm that make it slow."""
     allowed = allowed_arguments(cls)
     limits = dict(_SMALL_NUMBERS)
     if "buffer_size" not in allowed:  # elsewhere n_steps is the n of n-step returns
         limits["n_steps"] = _SMALL_ROLLOUT
-    small: dict[str, Any] = {
+    small: dict[str, object] = {
         name: min(limit, given[name]) if isinstance(given.get(name), (int, float)) else limit
         for name, limit in limits.items()
         if name in allowed
@@ -360,7 +398,7 @@ def _small(cls: type, given: Mapping[str, Any]) -> dict[str, Any]:
     return small
 
 
-def _act(model: Any, observations: Any) -> np.ndarray:
+def _act(model: Algorithm, observations: Observation) -> np.ndarray:
     return np.asarray(model.predict(observations, deterministic=True)[0])
 
 
@@ -370,17 +408,17 @@ def _generators() -> str:
     return repr(state | {"torch": state["torch"].tolist()})
 
 
-def _learns(model: Any) -> bool:
+def _learns(model: Algorithm) -> bool:
     return bool(_weights(model))
 
 
-def _weights(model: Any) -> dict[str, np.ndarray]:
+def _weights(model: Algorithm) -> dict[str, np.ndarray]:
     """Return copies of all tensors: parameters, target networks, optimizer moments."""
     tensors = capture({"algorithm": model}, with_buffers=False).tensors
     return {name: tensor.cpu().numpy().copy() for name, tensor in tensors.items()}
 
 
-def _differences(one: Any, other: Any) -> list[str]:
+def _differences(one: Algorithm, other: Algorithm) -> list[str]:
     """Compare all tensors and arrays of two algorithms, replay buffers included."""
     states = []
     for model in (one, other):
@@ -401,11 +439,11 @@ def _unequal(one: Mapping[str, np.ndarray], other: Mapping[str, np.ndarray]) -> 
     )
 
 
-def _map(observations: Any, change: Any) -> Any:
+def _map(observations: Observation, change: Callable[[np.ndarray], np.ndarray]) -> Observation:
     if isinstance(observations, dict):
         return {key: change(values) for key, values in observations.items()}
     return change(observations)
 
 
-def _named(observations: Any) -> dict[str, np.ndarray]:
+def _named(observations: Observation) -> dict[str, np.ndarray]:
     return observations if isinstance(observations, dict) else {"observation": observations}

@@ -6,11 +6,11 @@ pickled and copied in the middle of an episode, and their rewards and ends can b
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+
+from scilab_rl.envs.types import Info, ResetResult, StepResult
 
 Observation = dict[str, np.ndarray]
 
@@ -57,7 +57,7 @@ class TinyReach(gym.Env):
         self._position = np.zeros(2, np.float32)
         self._goal = np.zeros(2, np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Put the point and the goal at random places."""
         super().reset(seed=seed)
         self._position = self._random_place()
@@ -65,7 +65,7 @@ class TinyReach(gym.Env):
         observation = self._observe()
         return observation, self._info(observation)
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Move the point.
 
         Args:
@@ -84,7 +84,9 @@ class TinyReach(gym.Env):
             info,
         )
 
-    def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
+    def compute_reward(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         """Return 0 where the goal is reached and -1 elsewhere.
 
         Shapes:
@@ -92,34 +94,38 @@ class TinyReach(gym.Env):
         """
         return -(self._distance(achieved_goal, desired_goal) > self.THRESHOLD).astype(np.float32)
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> bool:
+    def compute_terminated(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> bool:
         """Return False: reaching the goal does not end the episode, staying there counts."""
         return False
 
-    def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> bool:
+    def compute_truncated(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> bool:
         """Return False: the step limit is a wrapper's business."""
         return False
 
-    def _movement(self, action: Any) -> np.ndarray:
+    def _movement(self, action: np.ndarray) -> np.ndarray:
         return np.clip(action, -1.0, 1.0)
 
     def _random_place(self) -> np.ndarray:
         return self.np_random.uniform(-0.9, 0.9, 2).astype(np.float32)
 
     def _observe(self) -> Observation:
-        # Copies, so that nobody who keeps an observation sees it move.
+        # Copies, so that stored observations do not change.
         return {
             "observation": self._position.copy(),
             "achieved_goal": self._position.copy(),
             "desired_goal": self._goal.copy(),
         }
 
-    def _info(self, observation: Observation) -> dict[str, Any]:
+    def _info(self, observation: Observation) -> Info:
         distance = self._distance(observation["achieved_goal"], observation["desired_goal"])
         return {"is_success": bool(distance <= self.THRESHOLD)}
 
     @staticmethod
-    def _distance(achieved_goal: np.ndarray, desired_goal: np.ndarray) -> Any:
+    def _distance(achieved_goal: np.ndarray, desired_goal: np.ndarray) -> np.ndarray:
         return np.sqrt(np.square(achieved_goal - desired_goal).sum(axis=-1))
 
 
@@ -132,7 +138,7 @@ class TinyReachDiscrete(TinyReach):
         super().__init__()
         self.action_space = spaces.Discrete(len(self._MOVEMENTS))
 
-    def _movement(self, action: Any) -> np.ndarray:
+    def _movement(self, action: np.ndarray) -> np.ndarray:
         return self._MOVEMENTS[int(action)]
 
 
@@ -144,14 +150,14 @@ class TinyBox(gym.Env):
         self.action_space = self._reach.action_space
         self.observation_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Put the point and the goal at random places."""
         super().reset(seed=seed)
         self._reach.np_random = self.np_random
         observation, info = self._reach.reset()
         return self._flat(observation), info
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Move the point; the reward is minus its distance to the goal."""
         observation, _, terminated, truncated, info = self._reach.step(action)
         distance = TinyReach._distance(observation["achieved_goal"], observation["desired_goal"])
@@ -177,14 +183,14 @@ class TinyDiscrete(gym.Env):
         self._place = 0.0
         self._paying_side = 1.0
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Put the walker near the middle and choose the door that pays."""
         super().reset(seed=seed)
         self._place = float(self.np_random.uniform(-0.3, 0.3))
         self._paying_side = 1.0 if self.np_random.random() < 0.5 else -1.0
         return self._observe(), {"is_success": False}
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Take a step to the left (0) or to the right (1)."""
         direction = 1.0 if int(action) == 1 else -1.0
         self._place = min(1.0, max(-1.0, self._place + self.STEP_LENGTH * direction))
@@ -216,19 +222,19 @@ class TinyPixels(gym.Env):
         self._episode = -1
         self._step = 0
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin the next episode."""
         super().reset(seed=seed)
         self._episode += 1
         self._step = 0
         return self._observe(), {}
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Count one step on; the action does not matter."""
         self._step += 1
         return self._observe(), self._episode + self._step / 100, False, False, {}
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray:
         """Return the current frame. Shapes: ``(64, 128, 3)``."""
         return encode_frame(self._episode, self._step)
 

@@ -1,4 +1,4 @@
-"""The exam that every environment takes.
+"""The contract test of every environment.
 
 An environment of your own takes it with three lines in a test file:
 
@@ -18,10 +18,11 @@ from collections.abc import Mapping
 from functools import partial
 from typing import Any
 
+from scilab_rl.check_results import FAIL, WARN
+from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs import fingerprint
-from scilab_rl.envs.examination import examine
-from scilab_rl.envs.vectorize import EnvSettings, make_single_env
-from scilab_rl.findings import FAIL, WARN
+from scilab_rl.envs.checker import check_environment
+from scilab_rl.envs.vectorize import make_single_env
 
 
 class EnvironmentContract:
@@ -41,10 +42,10 @@ class EnvironmentContract:
 
     def test_doctor_finds_no_fault(self) -> None:
         """Keys and shapes, rewards, success, endings, goals, seeds, pickling, stability."""
-        make = partial(make_single_env, EnvSettings(self.env, self.env_kwargs))
+        make = partial(make_single_env, RunConfig(self.env, self.env_kwargs))
         faults = [
             f"{finding.check}: {finding.found} ({finding.fix})"
-            for finding in examine(
+            for finding in check_environment(
                 make, n_steps=self.n_steps, known_fingerprints=fingerprint.known(self.env)
             )
             if finding.result in (WARN, FAIL) and finding.check not in self.accepted

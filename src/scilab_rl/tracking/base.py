@@ -1,50 +1,29 @@
-"""What a tracker is: somebody who is told what happens in a run and cannot change it."""
+"""The interface of trackers, which are notified of a run's events and cannot change it."""
 
 from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.redaction import redact
 from scilab_rl.results import RunResult
 
 
 @dataclass(frozen=True)
-class RunInfo:
-    """What trackers know about a run when it begins.
+class TrackedRun:
+    """A run as its trackers know it when it begins.
 
     Attributes:
+        cfg: The configuration of the run.
         run_dir: The run's directory.
-        base_logdir: The directory of all runs.
-        env: Environment id.
-        algorithm: Algorithm name.
-        seed: Seed of the run.
-        total_steps: Environment steps of all epochs.
-        n_epochs: Most epochs.
-        parameters: The whole configuration, flat: ``algorithm.gamma`` to its value.
-        project: Project or experiment name for remote trackers, or None.
-        entity: Team name for Weights & Biases, or None.
-        group: Group of runs, or None.
-        tags: Tags for remote trackers.
-        notes: The user's ``info`` text.
-        resumed_step: Step at which an interrupted run goes on, or None for a new run.
+        resumed_step: Step at which an interrupted run continues, or None for a new run.
     """
 
+    cfg: RunConfig
     run_dir: Path
-    base_logdir: Path
-    env: str
-    algorithm: str
-    seed: int
-    total_steps: int
-    n_epochs: int
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    project: str | None = None
-    entity: str | None = None
-    group: str | None = None
-    tags: tuple[str, ...] = ()
-    notes: str = ""
     resumed_step: int | None = None
 
     @property
@@ -52,17 +31,40 @@ class RunInfo:
         """The name of the run's directory."""
         return self.run_dir.name
 
+    @property
+    def base_logdir(self) -> Path:
+        """The directory of all runs."""
+        return Path(self.cfg.base_logdir)
+
+    @property
+    def project(self) -> str:
+        """Project or experiment name for remote trackers."""
+        return self.cfg.project_name or "scilab-rl"
+
+    @property
+    def tags(self) -> list[str]:
+        """Tags for remote trackers."""
+        return [str(tag) for tag in self.cfg.tags or ()]
+
+    @property
+    def parameters(self) -> dict[str, object]:
+        """The whole configuration without secrets: ``algorithm.gamma`` to its value."""
+        return {
+            name: redact(value) if isinstance(value, str) else value
+            for name, value in self.cfg.flat().items()
+        }
+
 
 class Tracker:
     """Base of all trackers; each method does nothing unless a tracker overrides it."""
 
-    def begin(self, run: RunInfo) -> None:
+    def begin(self, run: TrackedRun) -> None:
         """Open what the tracker writes to."""
 
     def step(self, step: int) -> None:
         """Hear that training has come to this step; called very often."""
 
-    def episode(self, episode: Mapping[str, Any]) -> None:
+    def episode(self, episode: Mapping[str, float]) -> None:
         """Hear about a finished training episode."""
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
@@ -76,8 +78,8 @@ class Tracker:
 
 
 @dataclass(frozen=True)
-class Held:
-    """What a place already knows of a run.
+class RemoteState:
+    """The part of a run that a tracker has already stored.
 
     Attributes:
         steps: The steps at which it has each metric.
@@ -91,10 +93,10 @@ class Held:
 
 
 class SyncableTracker(Tracker):
-    """A tracker that can be told later what it has missed, see `scilab_rl.tracking.sync`."""
+    """A tracker to which missed events can be sent later, see `scilab_rl.tracking.sync`."""
 
     @abstractmethod
-    def held(self, run: RunInfo, names: Iterable[str], result: RunResult) -> Held:
+    def remote_state(self, run: TrackedRun, names: Iterable[str], result: RunResult) -> RemoteState:
         """Return what is there already; changes nothing, and may be called before `begin`.
 
         Args:
@@ -108,13 +110,13 @@ class TrackerGroup(Tracker):
     """Passes everything on to several trackers, in order.
 
     Args:
-        trackers: The trackers; those that may fail must be wrapped in a mirror.
+        trackers: The trackers; wrap those that may fail in a `BackgroundTracker`.
     """
 
     def __init__(self, trackers: Iterable[Tracker]) -> None:
         self.trackers = list(trackers)
 
-    def begin(self, run: RunInfo) -> None:
+    def begin(self, run: TrackedRun) -> None:
         """Open all trackers."""
         for tracker in self.trackers:
             tracker.begin(run)
@@ -124,7 +126,7 @@ class TrackerGroup(Tracker):
         for tracker in self.trackers:
             tracker.step(step)
 
-    def episode(self, episode: Mapping[str, Any]) -> None:
+    def episode(self, episode: Mapping[str, float]) -> None:
         """Pass on an episode."""
         for tracker in self.trackers:
             tracker.episode(episode)

@@ -1,4 +1,4 @@
-"""Progress on the terminal: one bar and a final table, or plain lines where nobody watches."""
+"""Progress on the terminal: one bar and a final table, or plain lines without a terminal."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ import os
 import sys
 import time
 from collections.abc import Mapping
-from typing import Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, Tracker
+from scilab_rl.tracking.base import TrackedRun, Tracker
 
 _REFRESH_SECONDS = 0.2
 _SHOWN = (
@@ -31,16 +30,16 @@ class ConsoleTracker(Tracker):
         self.console = Console(stderr=True)
         self.live = is_interactive()
         self._progress: Progress | None = None
-        self._task: Any = None
-        self._run: RunInfo | None = None
+        self._task = TaskID(0)
+        self._run: TrackedRun | None = None
         self._next_refresh = 0.0
 
-    def begin(self, run: RunInfo) -> None:
+    def begin(self, run: TrackedRun) -> None:
         """Say what begins and show the bar."""
-        self._run = run
+        self._run, cfg = run, run.cfg
         self._say(
-            f"{run.algorithm} learns {run.env} (seed {run.seed}, up to {run.n_epochs} epochs); "
-            f"everything goes to {run.run_dir}"
+            f"{cfg.algorithm.name} learns {cfg.env} (seed {cfg.seed}, up to {cfg.n_epochs} "
+            f"epochs); everything goes to {run.run_dir}"
         )
         if self.live:
             self._progress = Progress(
@@ -54,7 +53,7 @@ class ConsoleTracker(Tracker):
                 transient=True,
             )
             self._task = self._progress.add_task(
-                "epoch 1", total=run.total_steps, speed="", result=""
+                "epoch 1", total=cfg.total_steps, speed="", result=""
             )
             self._progress.start()
 
@@ -96,7 +95,7 @@ class ConsoleTracker(Tracker):
 
 
 def is_interactive() -> bool:
-    """Tell whether a person watches: a terminal that can redraw, and not a CI job."""
+    """Return whether a person watches: a terminal that can redraw, and not a CI job."""
     plain = os.environ.get("TERM") == "dumb" or "CI" in os.environ
     return sys.stderr.isatty() and not plain
 
@@ -116,10 +115,15 @@ def print_table(rows: list[tuple[str, str]], title: str | None = None) -> None:
     Console().print(table)
 
 
-def _result_rows(result: RunResult, run: RunInfo | None) -> list[tuple[str, str]]:
+def _result_rows(result: RunResult, run: TrackedRun | None) -> list[tuple[str, str]]:
     rows = [("status", result.status.replace("_", " "))]
     if run is not None:
-        rows += [("algorithm", run.algorithm), ("environment", run.env), ("seed", str(run.seed))]
+        cfg = run.cfg
+        rows += [
+            ("algorithm", cfg.algorithm.name),
+            ("environment", cfg.env),
+            ("seed", str(cfg.seed)),
+        ]
     for name, label in _SHOWN:
         if name in result.metrics:
             rows.append((label, f"{result.metrics[name]:.3g}"))

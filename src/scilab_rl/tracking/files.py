@@ -1,4 +1,4 @@
-"""The run's own files: the only truth, written before any mirror hears of it."""
+"""The run's own files: the authoritative record, written before any other tracker."""
 
 from __future__ import annotations
 
@@ -7,14 +7,14 @@ import csv
 import io
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from scilab_rl import files
 from scilab_rl.errors import ScilabRLError
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, Tracker
+from scilab_rl.tracking.base import TrackedRun, Tracker
 
 CSV, JSONL = "metrics.csv", "metrics.jsonl"
 
@@ -31,14 +31,14 @@ class FilesTracker(Tracker):
         self._jsonl: IO[str] | None = None
         self._run_dir = Path()
 
-    def begin(self, run: RunInfo) -> None:
+    def begin(self, run: TrackedRun) -> None:
         """Open the files for appending."""
         self._run_dir = run.run_dir
         if run.resumed_step is not None:
             self._go_back_to(run.resumed_step)
         self._jsonl = (run.run_dir / JSONL).open("a", encoding="utf-8", buffering=1)
 
-    def episode(self, episode: Mapping[str, Any]) -> None:
+    def episode(self, episode: Mapping[str, float]) -> None:
         """Append a line about a training episode."""
         self._write_line({"kind": "episode", **episode})
 
@@ -49,18 +49,18 @@ class FilesTracker(Tracker):
         self._rows.append(row)
         with self._errors_named(CSV):
             self._append_csv(row)
-            files.crash_point("metrics.after_row")
+            files.fault_point("metrics.after_row")
 
     def end(self, result: RunResult) -> None:
         """Close the files."""
         if self._jsonl is not None:
-            with contextlib.suppress(OSError):  # a full disk has been told when it was met
+            with contextlib.suppress(OSError):  # a full disk has already been reported
                 self._jsonl.close()
 
     def _go_back_to(self, step: int) -> None:
         """Drop what was written after a checkpoint: it will be measured again."""
         path = self._run_dir / JSONL
-        lines = [line for line in _parsed_lines(path) if line["step"] <= step]
+        lines = [line for line in files.read_json_lines(path) if line["step"] <= step]
         files.write_text(path, "".join(json.dumps(line) + "\n" for line in lines))
         self._rows = [
             {key: value for key, value in line.items() if key != "kind"}
@@ -73,12 +73,12 @@ class FilesTracker(Tracker):
         else:
             (self._run_dir / CSV).unlink(missing_ok=True)
 
-    def _write_line(self, line: Mapping[str, Any]) -> None:
+    def _write_line(self, line: Mapping[str, object]) -> None:
         assert self._jsonl is not None
         with self._errors_named(JSONL):
-            files.crash_point("metrics.before_line")
+            files.fault_point("metrics.before_line")
             self._jsonl.write(json.dumps(line) + "\n")
-            files.crash_point("metrics.after_line")
+            files.fault_point("metrics.after_line")
 
     def _append_csv(self, row: Mapping[str, float]) -> None:
         path = self._run_dir / CSV
@@ -89,7 +89,7 @@ class FilesTracker(Tracker):
         self._columns = _ordered_columns([*self._columns, *row])
         files.write_text(path, self._format(self._rows, header=True))
 
-    def _format(self, rows: list[Any], *, header: bool) -> str:
+    def _format(self, rows: Sequence[Mapping[str, object]], *, header: bool) -> str:
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, self._columns, restval="", lineterminator="\n")
         if header:
@@ -97,35 +97,16 @@ class FilesTracker(Tracker):
         writer.writerows(rows)
         return text.getvalue()
 
-    def _errors_named(self, name: str) -> _DiskErrors:
-        return _DiskErrors(self._run_dir / name)
-
-
-class _DiskErrors:
-    """Says which file could not be written and how much space is left."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: Any, error: BaseException | None, traceback: Any) -> None:
-        if isinstance(error, OSError):
+    @contextlib.contextmanager
+    def _errors_named(self, name: str) -> Iterator[None]:
+        """Say which file could not be written and how much space is left."""
+        path = self._run_dir / name
+        try:
+            yield
+        except OSError as error:
             raise ScilabRLError(
-                f"'{self.path}' cannot be written: {error.strerror} "
-                f"({_free_space(self.path)} free)."
+                f"'{path}' cannot be written: {error.strerror} ({_free_space(path)} free)."
             ) from error
-
-
-def _parsed_lines(path: Path) -> list[dict[str, Any]]:
-    """Return the whole lines of a JSONL file; a killed run may have left half of the last one."""
-    lines = []
-    if path.is_file():
-        for line in path.read_text(encoding="utf-8").splitlines():
-            with contextlib.suppress(ValueError):
-                lines.append(json.loads(line))
-    return lines
 
 
 def _free_space(path: Path) -> str:

@@ -1,8 +1,7 @@
-"""MLflow: all runs in one SQLite database beside them, browsed with ``make mlflow``."""
+"""MLflow: all runs in one SQLite database next to them, browsed with ``make mlflow``."""
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import time
@@ -11,16 +10,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from scilab_rl import files, telemetry
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import Held, RunInfo, SyncableTracker
+from scilab_rl.tracking.base import RemoteState, SyncableTracker, TrackedRun
+from scilab_rl.tracking.names import encoded, is_plain_path
 
 _RUN_ID_FILE = "mlflow_run_id.txt"
 _MAX_PARAMETERS = 100  # of one log_batch
 _MAX_VALUE_CHARACTERS = 6000
+_MAX_NAME_CHARACTERS = 250
 _REFUSED_IN_NAMES = re.compile(r"[^\w\-. :/]", re.ASCII)
+_REFUSED_IN_OTHER_PATHS = re.compile(r"[^\w\- :]", re.ASCII)  # /a, a//b, a/../b are refused
 _SETTINGS = {
-    "MLFLOW_DISABLE_TELEMETRY": "true",
-    "DO_NOT_TRACK": "true",
     "MLFLOW_LOGGING_LEVEL": "WARNING",
     # MLflow's own patience with a server that is not there is minutes; many runs are shorter.
     "MLFLOW_HTTP_REQUEST_MAX_RETRIES": "1",
@@ -43,8 +44,8 @@ class MLflowTracker(SyncableTracker):
         self._client: Any = None
         self._run_id = ""
 
-    def begin(self, run: RunInfo) -> None:
-        """Create the run, or go on with it after a resume."""
+    def begin(self, run: TrackedRun) -> None:
+        """Create the run, or continue it after a resume."""
         known = self._find(run)
         if known is not None:
             self._run_id = known.info.run_id
@@ -53,10 +54,11 @@ class MLflowTracker(SyncableTracker):
             return
         with _locked(run.base_logdir / ".mlflow.lock"):  # two runs must not both create it
             experiment = self._experiment(run)
-            tags = {"mlflow.note.content": run.notes} | dict.fromkeys(run.tags, "true")
-            if run.group:
-                tags |= {"group": run.group, _PARENT: self._group(experiment, run.group)}
-        created = self._client.create_run(experiment, run_name=run.name, tags=tags)
+            tags = {"mlflow.note.content": run.cfg.info}
+            tags |= dict.fromkeys(map(_allowed, run.tags), "true")
+            if group := run.cfg.group:
+                tags |= {"group": group, _PARENT: self._group(experiment, group)}
+        created = self._client.create_run(experiment, run_name=run_name(run), tags=tags)
         self._run_id = created.info.run_id
         (run.run_dir / _RUN_ID_FILE).write_text(self._run_id, encoding="utf-8")
         self._log_parameters(run, {})
@@ -77,14 +79,14 @@ class MLflowTracker(SyncableTracker):
         """Set the final status."""
         self._client.set_terminated(self._run_id, status=_final_status(result))
 
-    def held(self, run: RunInfo, names: Iterable[str], result: RunResult) -> Held:
+    def remote_state(self, run: TrackedRun, names: Iterable[str], result: RunResult) -> RemoteState:
         """Ask the database."""
         known = self._find(run)
         if known is None:
-            return Held({}, frozenset(), is_closed=False)
+            return RemoteState({}, frozenset(), is_closed=False)
         run_id = known.info.run_id
         has_all_parameters = set(map(_allowed, run.parameters)) <= set(known.data.params)
-        return Held(
+        return RemoteState(
             steps={
                 name: {m.step for m in self._client.get_metric_history(run_id, _allowed(name))}
                 for name in names
@@ -93,7 +95,7 @@ class MLflowTracker(SyncableTracker):
             is_closed=has_all_parameters and known.info.status == _final_status(result),
         )
 
-    def _find(self, run: RunInfo) -> Any:
+    def _find(self, run: TrackedRun) -> Any:
         """Return the run as the database knows it, or None; opens the database."""
         _apply_settings()
         from mlflow.tracking import MlflowClient
@@ -105,10 +107,10 @@ class MLflowTracker(SyncableTracker):
         if known is not None:
             return known
         # The id may be that of another database, or a server has created it and not answered.
-        experiment = self._client.get_experiment_by_name(_project(run))
+        experiment = self._client.get_experiment_by_name(run.project)
         if experiment is None:
             return None
-        named = f"attributes.run_name = '{run.name}'"
+        named = f"attributes.run_name = '{run_name(run)}'"
         found = self._client.search_runs([experiment.experiment_id], named)
         return found[0] if found else None
 
@@ -123,13 +125,12 @@ class MLflowTracker(SyncableTracker):
             raise
         return known if known.info.lifecycle_stage == "active" else None
 
-    def _experiment(self, run: RunInfo) -> str:
-        name = _project(run)
-        found = self._client.get_experiment_by_name(name)
+    def _experiment(self, run: TrackedRun) -> str:
+        found = self._client.get_experiment_by_name(run.project)
         if found is not None:
             return found.experiment_id
         artifacts = (run.base_logdir.resolve() / "mlflow_artifacts").as_uri()
-        return self._client.create_experiment(name, artifact_location=artifacts)
+        return self._client.create_experiment(run.project, artifact_location=artifacts)
 
     def _group(self, experiment: str, name: str) -> str:
         """Return the id of the run below which MLflow shows the runs of a group."""
@@ -142,7 +143,7 @@ class MLflowTracker(SyncableTracker):
         self._client.set_terminated(parent)
         return parent
 
-    def _log_parameters(self, run: RunInfo, known: Mapping[str, str]) -> None:
+    def _log_parameters(self, run: TrackedRun, known: Mapping[str, str]) -> None:
         """Write the parameters that are not known; MLflow refuses to change the others."""
         from mlflow.entities import Param
 
@@ -155,8 +156,9 @@ class MLflowTracker(SyncableTracker):
             self._client.log_batch(self._run_id, params=parameters[start : start + _MAX_PARAMETERS])
 
 
-def _project(run: RunInfo) -> str:
-    return run.project or "scilab-rl"
+def run_name(run: TrackedRun) -> str:
+    """Return the name under which MLflow shows a run; its lists cut names at their end."""
+    return f"{run.cfg.algorithm.name} s{run.cfg.seed} {run.name}"
 
 
 def _final_status(result: RunResult) -> str:
@@ -165,13 +167,15 @@ def _final_status(result: RunResult) -> str:
 
 def _apply_settings() -> None:
     """Make MLflow quiet and quick; it reads these when it is imported."""
+    telemetry.switch_off()
     for name, value in _SETTINGS.items():
         os.environ.setdefault(name, value)
 
 
 def _allowed(name: str) -> str:
-    """Return the name without the characters that would make MLflow refuse the whole batch."""
-    return _REFUSED_IN_NAMES.sub("_", name)
+    """Return the name in characters that do not make MLflow refuse the whole batch."""
+    refused = _REFUSED_IN_NAMES if is_plain_path(name) else _REFUSED_IN_OTHER_PATHS
+    return encoded(name, refused, _MAX_NAME_CHARACTERS)
 
 
 def prepare_database(base_logdir: Path) -> str:
@@ -196,5 +200,5 @@ def prepare_database(base_logdir: Path) -> str:
 @contextmanager
 def _locked(path: Path) -> Iterator[None]:
     with path.open("w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        files.lock(file)
         yield

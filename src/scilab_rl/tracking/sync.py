@@ -4,18 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, SyncableTracker
+from scilab_rl.tracking.base import SyncableTracker, TrackedRun
 
 _NO_METRICS = ("kind", "epoch", "step")
 
 
 def sync(
     tracker: SyncableTracker,
-    run: RunInfo,
-    epochs: Sequence[Mapping[str, Any]],
+    run: TrackedRun,
+    epochs: Sequence[Mapping[str, float]],
     files: Sequence[Path],
     result: RunResult,
 ) -> tuple[int, int] | None:
@@ -23,7 +22,7 @@ def sync(
 
     Args:
         tracker: The tracker, not begun.
-        run: What it was told when the run began, or would have been.
+        run: The run, as at its beginning.
         epochs: The run's rows of ``metrics.jsonl`` that describe epochs.
         files: Its videos and pages.
         result: How it ended.
@@ -32,18 +31,18 @@ def sync(
         How many values and files have been sent, or None if nothing was missing.
     """
     values = [{n: v for n, v in row.items() if n not in _NO_METRICS} for row in epochs]
-    held = tracker.held(run, {name for row in values for name in row}, result)
+    remote = tracker.remote_state(run, {name for row in values for name in row}, result)
     missing = []
     for row, metrics in zip(epochs, values, strict=True):
-        new = {n: v for n, v in metrics.items() if row["step"] not in held.steps.get(n, ())}
+        new = {n: v for n, v in metrics.items() if row["step"] not in remote.steps.get(n, ())}
         if new:
             missing.append((row, new))
-    unsent = [p for p in files if held.files is not None and p.name not in held.files]
-    if held.is_closed and not missing and not unsent:
+    unsent = [p for p in files if remote.files is not None and p.name not in remote.files]
+    if remote.is_closed and not missing and not unsent:
         return None
     tracker.begin(run)
     for row, new in missing:
-        tracker.epoch(row["step"], row["epoch"], new)
+        tracker.epoch(int(row["step"]), int(row["epoch"]), new)
     for path in unsent:
         tracker.artifact(path)
     tracker.end(result)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import Held, RunInfo, SyncableTracker
+from scilab_rl.tracking.base import RemoteState, SyncableTracker, TrackedRun
 
 
 class TensorBoardTracker(SyncableTracker):
@@ -16,21 +16,21 @@ class TensorBoardTracker(SyncableTracker):
     def __init__(self) -> None:
         self._writer: Any = None
 
-    def begin(self, run: RunInfo) -> None:
+    def begin(self, run: TrackedRun) -> None:
         """Open the event file."""
         from torch.utils.tensorboard import SummaryWriter
 
         self._writer = SummaryWriter(str(_folder(run)))
 
-    def held(self, run: RunInfo, names: Iterable[str], result: RunResult) -> Held:
+    def remote_state(self, run: TrackedRun, names: Iterable[str], result: RunResult) -> RemoteState:
         """Read the event files."""
         if not _folder(run).is_dir():
-            return Held({})
+            return RemoteState({})
         from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
         events = EventAccumulator(str(_folder(run)), size_guidance={"scalars": 0}).Reload()
         known = events.Tags()["scalars"]
-        return Held({n: {e.step for e in events.Scalars(n)} for n in names if n in known})
+        return RemoteState({n: {e.step for e in events.Scalars(n)} for n in names if n in known})
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
         """Write the metrics of an epoch."""
@@ -43,5 +43,5 @@ class TensorBoardTracker(SyncableTracker):
         self._writer.close()
 
 
-def _folder(run: RunInfo) -> Path:
+def _folder(run: TrackedRun) -> Path:
     return run.run_dir / "tensorboard"

@@ -5,14 +5,19 @@ from __future__ import annotations
 import logging
 import netrc
 import os
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from scilab_rl import telemetry
+from scilab_rl.errors import first_line
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo, Tracker
+from scilab_rl.tracking.base import TrackedRun, Tracker
+from scilab_rl.tracking.names import encoded
 
 _PATIENCE_SECONDS = 10.0
+_RESERVED = re.compile(r"^_(?=(?:step|runtime|timestamp|wandb)$)")  # columns of its own
 _log = logging.getLogger(__name__)
 
 
@@ -27,9 +32,9 @@ class WandbTracker(Tracker):
         self.mode = mode
         self._run: Any = None
 
-    def begin(self, run: RunInfo) -> None:
+    def begin(self, run: TrackedRun) -> None:
         """Open the run."""
-        os.environ.setdefault("WANDB_ERROR_REPORTING", "false")
+        telemetry.switch_off()
         os.environ.setdefault("WANDB_SILENT", "true")
         # Not in the home directory: a run leaves its traces among the runs and nowhere else.
         for folder in ("WANDB_CACHE_DIR", "WANDB_DATA_DIR"):
@@ -42,13 +47,14 @@ class WandbTracker(Tracker):
         except wandb.Error as error:
             if mode == "offline":
                 raise
-            _log.warning("W&B cannot be reached (%s); the run is kept offline.", _first_line(error))
+            _log.warning("W&B cannot be reached (%s); the run is kept offline.", first_line(error))
             wandb.teardown()  # its service still holds the name of the run
             self._run = _open(run, "offline")
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
         """Write the metrics of an epoch."""
-        self._run.log(dict(values), step=step)
+        named = {encoded(name, _RESERVED): value for name, value in values.items()}
+        self._run.log(named, step=step)
 
     def artifact(self, path: Path) -> None:
         """Add a video to the run's page."""
@@ -66,32 +72,28 @@ class WandbTracker(Tracker):
             _log.info("W&B is offline; sync with: wandb sync %s", Path(self._run.dir).parent)
 
 
-def _open(run: RunInfo, mode: str) -> Any:
+def _open(run: TrackedRun, mode: str) -> Any:
     import wandb
 
     return wandb.init(
-        project=run.project or "scilab-rl",
-        entity=run.entity,
-        group=run.group,
-        tags=list(run.tags) or None,
-        notes=run.notes or None,
+        project=run.project,
+        entity=run.cfg.entity,
+        group=run.cfg.group,
+        tags=run.tags or None,
+        notes=run.cfg.info or None,
         name=run.name,
         id=run.name,
         resume="allow",
         dir=str(run.run_dir),
-        config=dict(run.parameters),
+        config=run.parameters,
         mode=mode,  # type: ignore[arg-type]
         # The terminal belongs to the console tracker, its text to train.log.
         settings=wandb.Settings(console="off", init_timeout=_PATIENCE_SECONDS),
     )
 
 
-def _first_line(error: Exception) -> str:
-    return str(error).strip().partition("\n")[0]
-
-
 def has_key() -> bool:
-    """Tell whether a key is known, from the environment or ``~/.netrc``."""
+    """Return whether a key is known, from the environment or ``~/.netrc``."""
     if os.environ.get("WANDB_API_KEY"):
         return True
     try:

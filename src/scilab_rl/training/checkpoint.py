@@ -25,13 +25,13 @@ from scilab_rl.training.snapshot import Snapshot
 SCHEMA_VERSION = 1
 MANIFEST = "manifest.json"
 _TENSORS, _STATE, _ARRAYS = "tensors.safetensors", "state.json", "arrays"
-# What reading somebody else's JSON can raise.
+# Errors of reading JSON that others wrote.
 _MALFORMED = (ValueError, KeyError, AttributeError, TypeError, RecursionError)
 _VERSIONED = ("torch", "numpy", "gymnasium", "stable-baselines3", "mujoco")
 
 
 def save(
-    snapshot: Snapshot, directory: Path, *, step: int, about: dict[str, Any] | None = None
+    snapshot: Snapshot, directory: Path, *, step: int, about: dict[str, object] | None = None
 ) -> None:
     """Write a snapshot; an existing one of the same name is replaced only by a complete one.
 
@@ -42,14 +42,14 @@ def save(
         about: More facts for the manifest.
     """
     files.remove_unfinished(directory.parent)
-    files.crash_point("checkpoint.begin")
+    files.fault_point("checkpoint.begin")
     unfinished = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
     (unfinished / _ARRAYS).mkdir(parents=True)
     try:
         _write_content(snapshot, unfinished)
-        files.crash_point("checkpoint.before_manifest")
+        files.fault_point("checkpoint.before_manifest")
         _write_manifest(unfinished, step, about or {})
-        files.crash_point("checkpoint.before_swap")
+        files.fault_point("checkpoint.before_swap")
         _swap(unfinished, directory)
     finally:
         shutil.rmtree(unfinished, ignore_errors=True)
@@ -71,7 +71,7 @@ def load(directory: Path) -> Snapshot:
                 raise ValueError(f"its manifest does not list {file}")
             array = np.load(directory / _ARRAYS / file, mmap_mode="r", allow_pickle=False)
             if not isinstance(array, np.ndarray):  # an archive of arrays
-                raise ValueError(f"{file} is no array")
+                raise ValueError(f"{file} is not an array")
             arrays[name] = array
         return Snapshot(stored["tree"], load_file(directory / _TENSORS), arrays)
     except (OSError, *_MALFORMED, SafetensorError) as error:
@@ -84,7 +84,8 @@ def verify(directory: Path) -> dict[str, Any]:
     Raises:
         CheckpointError: If it does not hold.
     """
-    _require_directory(directory)
+    if not directory.is_dir():
+        raise ConfigError(f"There is no saved policy in '{directory}'.")
     try:
         manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
         entries = [
@@ -92,7 +93,7 @@ def verify(directory: Path) -> dict[str, Any]:
         ]
         schema = manifest["schema_version"]
     except (OSError, *_MALFORMED) as error:
-        raise CheckpointError(f"'{directory}' is no complete checkpoint: {error}") from error
+        raise CheckpointError(f"'{directory}' is not a complete checkpoint: {error}") from error
     if schema != SCHEMA_VERSION:
         raise CheckpointError(
             f"'{directory}' has format {schema}; this version of Scilab-RL reads {SCHEMA_VERSION}."
@@ -120,11 +121,6 @@ def _present(directory: Path) -> Path:
     return previous if not directory.exists() and previous.is_dir() else directory
 
 
-def _require_directory(directory: Path) -> None:
-    if not directory.is_dir():
-        raise ConfigError(f"There is no saved policy in '{directory}'.")
-
-
 def _write_content(snapshot: Snapshot, directory: Path) -> None:
     tensors = {
         name: tensor.detach().cpu().contiguous().clone()
@@ -134,7 +130,7 @@ def _write_content(snapshot: Snapshot, directory: Path) -> None:
         save_file(tensors, directory / _TENSORS)
     except SafetensorError as error:  # its word for a full disk
         raise OSError(str(error)) from error
-    files.crash_point("checkpoint.after_tensors")
+    files.fault_point("checkpoint.after_tensors")
     with (directory / _TENSORS).open("rb") as file:
         os.fsync(file.fileno())
     names = {}
@@ -142,13 +138,13 @@ def _write_content(snapshot: Snapshot, directory: Path) -> None:
         names[name] = f"{index}.npy"
         with (directory / _ARRAYS / names[name]).open("wb") as file:
             np.save(file, array, allow_pickle=False)
-            files.crash_point("checkpoint.in_arrays")
+            files.fault_point("checkpoint.in_arrays")
             file.flush()
             os.fsync(file.fileno())
     files.write_json(directory / _STATE, {"arrays": names, "tree": snapshot.tree})
 
 
-def _write_manifest(directory: Path, step: int, about: dict[str, Any]) -> None:
+def _write_manifest(directory: Path, step: int, about: dict[str, object]) -> None:
     contents = sorted(path for path in directory.rglob("*") if path.is_file())
     files.write_json(
         directory / MANIFEST,
@@ -188,7 +184,7 @@ def _swap(finished: Path, directory: Path) -> None:
     if directory.exists():
         files.discard(previous)
         directory.rename(previous)
-    files.crash_point("checkpoint.in_swap")
+    files.fault_point("checkpoint.in_swap")
     finished.rename(directory)
     files.fsync_directory(directory.parent)
     files.discard(previous)

@@ -2,32 +2,32 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.vec_env import VecEnv, unwrap_vec_wrapper
 
-from scilab_rl.envs.observed import success_of
+from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.learning.algorithm import Policy
+from scilab_rl.metrics.success import episode_outcomes, success_metrics, success_of
 
 
 @dataclass
 class Episode:
-    """What happened in one episode.
+    """The rewards and the success of one episode.
 
     Attributes:
         rewards: Reward of each step.
-        success: Success at the last step; None when the task has no such notion.
-        success_once: Success at any step.
+        success: Success that the last step reported; None when it reported none.
+        success_once: Success at any step; None when no step reported any.
     """
 
     rewards: list[float] = field(default_factory=list)
     success: bool | None = None
     success_once: bool | None = None
 
-    def add(self, reward: float, info: dict[str, Any]) -> None:
+    def add(self, reward: float, info: dict[str, object]) -> None:
         """Add a step."""
         self.rewards.append(float(reward))
         self.success = success_of(info)
@@ -41,15 +41,33 @@ class Evaluation:
 
     episodes: list[Episode]
 
-    def metrics(self, prefix: str = "eval") -> dict[str, float]:
-        """Return the means over the episodes, named as Stable-Baselines3 names them."""
+    @property
+    def reports_success(self) -> bool:
+        """Whether any step of any episode reported success or failure."""
+        return any(episode.success_once is not None for episode in self.episodes)
+
+    @property
+    def reported(self) -> list[bool | None]:
+        """The success that each episode reported at its end."""
+        return [episode.success for episode in self.episodes]
+
+    def metrics(self, prefix: str = "eval", *, reports_success: bool = False) -> dict[str, float]:
+        """Return the means over the episodes, named as Stable-Baselines3 names them.
+
+        Args:
+            prefix: Section of the names.
+            reports_success: Whether the task is known to report success, from other episodes: one
+                that reports it only when it succeeds says nothing about a failure.
+        """
         values = {
             "mean_reward": float(np.mean([sum(e.rewards) for e in self.episodes])),
             "mean_ep_length": float(np.mean([len(e.rewards) for e in self.episodes])),
             "rollout_rewards_step": self.episodes[-1].rewards[-1],
         }
-        if all(e.success is not None for e in self.episodes):
-            values["success_rate"] = float(np.mean([bool(e.success) for e in self.episodes]))
+        known = reports_success or self.reports_success
+        outcomes = episode_outcomes(self.reported, reports_success=known)
+        if outcomes is not None:
+            values |= success_metrics(outcomes, self.reported)
             values["success_once_rate"] = float(
                 np.mean([bool(e.success_once) for e in self.episodes])
             )
@@ -57,7 +75,7 @@ class Evaluation:
 
 
 def evaluate(
-    policy: Any,
+    policy: Policy,
     env: VecEnv,
     n_episodes: int,
     seed: int,
@@ -71,7 +89,7 @@ def evaluate(
     evaluation nor the training environments matter.
 
     Args:
-        policy: Anything with Stable-Baselines3's ``predict``.
+        policy: Policything with Stable-Baselines3's ``predict``.
         env: A vector environment with one environment.
         n_episodes: How many episodes, at least 1.
         seed: Seed of the first episode; the others follow from it.
@@ -80,6 +98,8 @@ def evaluate(
     """
     env.seed(seed)
     observation = env.reset()
+    # Layers above it may change rewards.
+    task = unwrap_vec_wrapper(env, ObservedVecEnv)
     episodes: list[Episode] = []
     episode, state, starts = Episode(), None, np.ones(1, dtype=bool)
     while len(episodes) < n_episodes:
@@ -87,25 +107,10 @@ def evaluate(
             observation, state=state, episode_start=starts, deterministic=deterministic
         )
         observation, rewards, starts, infos = env.step(action)
-        episode.add(rewards[0], infos[0])
+        episode.add((rewards if task is None else task.task_rewards)[0], infos[0])
         if starts[0]:
             episodes.append(episode)
             if on_episode is not None:
                 on_episode(episode)
             episode = Episode()
     return Evaluation(episodes)
-
-
-def wilson_interval(successes: int, n: int, z: float = 1.959964) -> tuple[float, float]:
-    """Return the 95 % Wilson score interval of a success rate (Wilson, 1927).
-
-    >>> low, high = wilson_interval(20, 20)
-    >>> round(low, 3), high
-    (0.839, 1.0)
-    """
-    rate = successes / n
-    centre = (rate + z * z / (2 * n)) / (1 + z * z / n)
-    half = z / (1 + z * z / n) * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
-    low = 0.0 if successes == 0 else centre - half
-    high = 1.0 if successes == n else centre + half
-    return low, high

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scilab_rl.envs.observed import StepBatch
 from scilab_rl.envs.stability import STATES_KEY, UNSTABLE_KEY
+from scilab_rl.envs.vec_step import ObservedStep
 
 _log = logging.getLogger(__name__)
 _MAX_FILES = 20
@@ -28,14 +28,14 @@ class InstabilityRecord:
         self.folder = folder
         self.n_episodes = 0
 
-    def on_step(self, batch: StepBatch) -> None:
+    def on_step(self, step: ObservedStep) -> None:
         """Look at a step of all environments."""
-        for index in np.flatnonzero(batch.dones):
-            info = batch.infos[int(index)]
+        for index in np.flatnonzero(step.dones):
+            info = step.infos[int(index)]
             states = info.pop(STATES_KEY, None)
             if info.get(UNSTABLE_KEY):
                 self.n_episodes += 1
-                self._keep(states, f"step-{batch.step:06d}-env{index}.npy")
+                self._keep(states, f"step-{step.step:06d}-env{index}.npy")
 
     def metrics(self) -> dict[str, float]:
         """Return ``env/unstable_episodes`` if there were any."""
@@ -48,4 +48,4 @@ class InstabilityRecord:
             self.folder.mkdir(exist_ok=True)
             np.save(self.folder / name, states, allow_pickle=False)
         except OSError as error:
-            _log.warning("%s could not be saved: %s. Training goes on.", name, error)
+            _log.warning("%s could not be saved: %s. Training continues.", name, error)

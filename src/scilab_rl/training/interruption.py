@@ -1,4 +1,4 @@
-"""Stopping politely: the first signal asks for a checkpoint, the second ends at once."""
+"""Graceful shutdown: the first signal requests a checkpoint, the second ends the process."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class StopRequest:
     """Remembers the first signal.
 
     Attributes:
-        signal_number: 0 as long as nobody has asked to stop.
+        signal_number: 0 as long as no stop is requested.
     """
 
     def __init__(self) -> None:
@@ -43,7 +43,7 @@ class StopRequest:
 
 
 @contextmanager
-def polite_stop() -> Iterator[StopRequest]:
+def graceful_shutdown() -> Iterator[StopRequest]:
     """Turn Ctrl-C and SIGTERM into a request while the block runs.
 
     Outside the main thread, where signals cannot be handled, the request stays empty.

@@ -7,10 +7,12 @@ import time
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+
+from scilab_rl.training.callbacks import KeepBest, RunCallback
+from scilab_rl.training.loop import Trainer
 
 # Part to the methods that do it, wherever they are found: our algorithms, Stable-Baselines3's, the
-# replay buffers, the trainer and the trackers.
+# replay buffers, the trainer and its callbacks.
 ENVIRONMENT, SAMPLING, UPDATE = "environment", "sampling", "update"
 WAITING, ACTING, STORING = "waiting for updates", "acting", "storing"
 EVALUATION, LOGGING, SAVING, RENDERING = "evaluation", "logging", "saving", "rendering"
@@ -30,7 +32,7 @@ REMEDIES = {
 
 @dataclass
 class Part:
-    """What one part of a run has cost.
+    """The time that one part of a run took.
 
     Attributes:
         seconds: Without the seconds of the parts inside of it.
@@ -65,14 +67,14 @@ class Profile:
         measured = sum(part.seconds for part in self.parts.values())
         self.parts[OTHER] = Part(max(self.seconds - measured, 0.0), 1)
 
-    def measure(self, name: str, owner: Any, method: str) -> None:
+    def measure(self, name: str, owner: object, method: str) -> None:
         """Count the time of a method of one object as a part; nothing if it has no such method."""
         if callable(function := getattr(owner, method, None)):
             setattr(owner, method, self._timed(name, function))
 
-    def _timed(self, name: str, function: Callable[..., Any]) -> Callable[..., Any]:
+    def _timed(self, name: str, function: Callable[..., object]) -> Callable[..., object]:
         @functools.wraps(function)
-        def timed(*args: Any, **kwargs: Any) -> Any:
+        def timed(*args: object, **kwargs: object) -> object:
             self._inside.append(0.0)
             started = time.perf_counter()
             try:
@@ -88,29 +90,36 @@ class Profile:
         return timed
 
 
-def attach(session: Any) -> Profile:
-    """Measure the parts of a run that is about to start.
+class Profiling(RunCallback):
+    """Measures the parts of a run from its beginning on.
 
     Args:
-        session: Of `scilab_rl.experiment.run`, which calls this as ``watch``.
+        profile: Where the seconds go.
     """
-    profile = Profile()
-    algorithm, trainer = session.algorithm, session.trainer
-    profile.measure(ENVIRONMENT, algorithm.get_env(), "step")
-    for env in getattr(session.train_env.unwrapped, "envs", []):
-        profile.measure(RENDERING, env, "render")
-    for method in ("explore", "_sample_action"):
-        profile.measure(ACTING, algorithm, method)
-    buffer = getattr(algorithm, "replay_buffer", None)
-    profile.measure(STORING, buffer, "add")
-    for method in ("sample", "sample_vectors"):
-        profile.measure(SAMPLING, buffer, method)
-    profile.measure(UPDATE, algorithm, "train")
-    profile.measure(UPDATE, getattr(algorithm, "rounds", None), "start")
-    profile.measure(WAITING, algorithm, "finish_round")
-    profile.measure(LOGGING, trainer, "_on_step")
-    profile.measure(EVALUATION, trainer, "_evaluate")
-    for method in ("_save_checkpoint", "save_policy"):
-        profile.measure(SAVING, trainer, method)
-    profile.start()
-    return profile
+
+    def __init__(self, profile: Profile) -> None:
+        super().__init__()
+        self.profile = profile
+
+    def begin(self, trainer: Trainer) -> None:
+        """Measure what the run calls."""
+        measure, model = self.profile.measure, trainer.state.model
+        measure(ENVIRONMENT, model.get_env(), "step")
+        for env in getattr(model.get_env().unwrapped, "envs", []):
+            measure(RENDERING, env, "render")
+        for method in ("explore", "_sample_action"):  # ours and Stable-Baselines3's
+            measure(ACTING, model, method)
+        buffer = getattr(model, "replay_buffer", None)
+        measure(STORING, buffer, "add")
+        for method in ("sample", "sample_vectors"):
+            measure(SAMPLING, buffer, method)
+        measure(UPDATE, model, "train")
+        measure(UPDATE, getattr(model, "rounds", None), "start")
+        measure(WAITING, model, "finish_round")
+        measure(LOGGING, trainer, "on_step")
+        measure(EVALUATION, trainer, "evaluate")
+        measure(SAVING, trainer.checkpoints, "save")
+        for callback in trainer.callbacks:
+            if isinstance(callback, KeepBest):
+                measure(SAVING, callback, "on_epoch")
+        self.profile.start()

@@ -1,88 +1,55 @@
-"""The complete state of a training run, and how it goes on from there as if nothing had happened.
-
-The state is taken where an algorithm begins a rollout: the last transition is stored, the last
-update is done, nothing is pending. Simulators are not saved but retold, see `envs.replayable`.
-"""
+"""Checkpoints of a run, and how it resumes from one as if it had not been interrupted."""
 
 from __future__ import annotations
 
-import copy
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from stable_baselines3.common.vec_env import VecEnv
+from stable_baselines3.common.callbacks import BaseCallback
 
 from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.types import Observation
 from scilab_rl.envs.vectorize import observed_layer
 from scilab_rl.errors import CheckpointError
-from scilab_rl.files import crash_point, discard, point_to, remove_unfinished
+from scilab_rl.files import discard, fault_point, point_to, remove_unfinished
+from scilab_rl.learning.algorithm import Algorithm
+from scilab_rl.learning.observations import single
 from scilab_rl.training import checkpoint
-from scilab_rl.training.snapshot import Snapshot, capture, random_state, restore, set_random_state
+from scilab_rl.training.snapshot import RandomState, Snapshot, restore, set_random_state
+from scilab_rl.training.state import RunState
 
 FOLDER, LAST = "checkpoints", "last"
 GENERATIONS = 2
 _log = logging.getLogger(__name__)
 
 
-def training_state(model: Any, trainer: Any, *, with_episodes: bool = True) -> dict[str, Any]:
-    """Return everything that the rest of the run depends on, name to object.
-
-    Args:
-        model: The algorithm.
-        trainer: The `Trainer` that watches it.
-        with_episodes: Whether the running episodes belong to it; otherwise a resumed run begins
-            new ones.
-    """
-    env = observed_layer(model.get_env())
-    return {
-        "algorithm": model,
-        "normalization": _normalization_layers(model.get_env()),
-        "environments": env.env_method("episode_state") if with_episodes else [],
-        "observed": env.state(),
-        "statistics": trainer.statistics,
-        "recorded": trainer.metric_logger.state(),
-        "history": {"steps": trainer.store.steps, "rows": trainer.store.rows},
-        "best": trainer.best,
-        "random": random_state(),
-    }
-
-
-def take(model: Any, trainer: Any, *, with_episodes: bool = True) -> Snapshot:
-    """Capture the state; tensors and arrays are views that later steps change."""
-    return capture(training_state(model, trainer, with_episodes=with_episodes))
-
-
-def frozen(snapshot: Snapshot) -> Snapshot:
-    """Return a copy that later steps do not change."""
-    return Snapshot(
-        copy.deepcopy(snapshot.tree),
-        {name: tensor.clone() for name, tensor in snapshot.tensors.items()},
-        {name: array.copy() for name, array in snapshot.arrays.items()},
-    )
-
-
-def continue_from(snapshot: Snapshot, model: Any, trainer: Any) -> None:
+def continue_from(snapshot: Snapshot, state: RunState) -> BaseCallback:
     """Bring a freshly built run to the state of a snapshot.
+
+    Returns:
+        A callback that must be the first one of `learn`.
 
     Raises:
         CheckpointError: If the snapshot is of another algorithm or environment.
     """
-    state = training_state(model, trainer, with_episodes=False)
+    model, parts = state.model, state.parts(with_episodes=False)
     # What has no counterpart in a fresh run is rebuilt from the description alone.
     for name in ("environments", "observed", "recorded", "random", "best"):
-        state[name] = None
-    restored = restore(state, snapshot)
-    trainer.best = tuple(restored["best"]) if restored["best"] is not None else None
-    trainer.metric_logger.set_state(restored["recorded"])
+        parts[name] = None
+    restored = restore(parts, snapshot)
+    for layer, memory in zip(state.layers, restored.get("normalization", []), strict=False):
+        vars(layer).update(memory)
+    state.best = tuple(restored["best"]) if restored["best"] is not None else None
+    state.logger.set_state(restored["recorded"])
     env = observed_layer(model.get_env())
-    if not _retell_episodes(env, restored["environments"], restored["observed"]):
+    if not _replay_episodes(env, restored["environments"], restored["observed"]):
         _begin_new_episodes(model)
-    # Retelling draws no numbers from the global generators; they come last to be sure.
+    # Replaying draws no numbers from the global generators; they come last to be sure.
     set_random_state(restored["random"])
-    trainer.at_first_rollout = _undo_preparations(model, restored["random"])
+    return _UndoPreparations(model, restored["random"])
 
 
 def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
@@ -95,9 +62,9 @@ def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
     folder.mkdir(exist_ok=True)
     directory = folder / f"step_{step:010d}"
     checkpoint.save(snapshot, directory, step=step)
-    crash_point("checkpoint.before_link")
+    fault_point("checkpoint.before_link")
     point_to(folder / LAST, directory)
-    crash_point("checkpoint.before_forgetting")
+    fault_point("checkpoint.before_forgetting")
     _forget(run_dir, older_than=directory)
     return directory
 
@@ -160,17 +127,7 @@ def _forget(run_dir: Path, *, older_than: Path) -> None:
             discard(old)
 
 
-def _normalization_layers(env: Any) -> list[Any]:
-    layers = []
-    while isinstance(env, VecEnv) and hasattr(env, "venv"):
-        if hasattr(env, "obs_rms"):
-            names = ("obs_rms", "ret_rms", "returns", "old_obs", "old_reward")
-            layers.append({name: getattr(env, name, None) for name in names})
-        env = env.venv
-    return layers
-
-
-def _retell_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[str, Any]) -> bool:
+def _replay_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[str, Any]) -> bool:
     """Bring each environment to its place; False when one does not repeat itself exactly."""
     repeated = [
         env.env_method("replay_episode", episode, indices=index)[0]
@@ -180,7 +137,7 @@ def _retell_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[st
     if not episodes:  # one of them had failed when the checkpoint was made
         return False
     for index, observation in enumerate(repeated):
-        if not _equal(observation, _entry(expected, index)):
+        if not _equal(observation, single(expected, index)):
             _log.warning(
                 "%s does not repeat an episode exactly; a new one is begun, so the rest of the run "
                 "differs from the uninterrupted one.",
@@ -191,24 +148,31 @@ def _retell_episodes(env: ObservedVecEnv, episodes: list[Any], observed: dict[st
     return True
 
 
-def _undo_preparations(model: Any, random: dict[str, Any]) -> Callable[[], None]:
-    """Return what undoes how ``learn`` prepares noise for its first rollout.
+class _UndoPreparations(BaseCallback):
+    """Undoes how ``learn`` prepares noise for its first rollout.
 
     Action noise is reset there, and that of gSDE (arXiv 2005.05719) is drawn, which the state has
     behind it.
     """
-    noise = getattr(model, "action_noise", None)
-    policy = getattr(model, "actor", None) or getattr(model, "policy", None)
-    prepared = [*getattr(noise, "noises", [noise]), getattr(policy, "action_dist", None)]
-    # What they draw replaces what they had, and does not change it: references are enough.
-    states = [(thing, dict(vars(thing))) for thing in prepared if hasattr(thing, "__dict__")]
 
-    def put_back() -> None:
-        for thing, state in states:  # in place: `learn` has handed them on already
-            vars(thing).update(state)
-        set_random_state(random)
+    def __init__(self, model: Algorithm, random: RandomState) -> None:
+        super().__init__()
+        self._random: RandomState | None = random
+        noise = getattr(model, "action_noise", None)
+        policy = getattr(model, "actor", None) or getattr(model, "policy", None)
+        prepared = [*getattr(noise, "noises", [noise]), getattr(policy, "action_dist", None)]
+        # What they draw replaces what they had, and does not change it: references are enough.
+        self._states = [(part, dict(vars(part))) for part in prepared if hasattr(part, "__dict__")]
 
-    return put_back
+    def _on_rollout_start(self) -> None:
+        if self._random is not None:
+            for part, state in self._states:  # in place: `learn` has handed them on already
+                vars(part).update(state)
+            set_random_state(self._random)
+            self._random = None
+
+    def _on_step(self) -> bool:
+        return True
 
 
 def _begin_new_episodes(model: Any) -> None:
@@ -221,14 +185,8 @@ def _begin_new_episodes(model: Any) -> None:
         truncate()
 
 
-def _entry(observations: Any, index: int) -> Any:
-    if isinstance(observations, dict):
-        return {key: value[index] for key, value in observations.items()}
-    return observations[index]
-
-
-def _equal(one: Any, other: Any) -> bool:
-    if isinstance(one, dict):
+def _equal(one: Observation, other: Observation) -> bool:
+    if isinstance(one, dict) and isinstance(other, dict):
         return set(one) == set(other) and all(_equal(one[key], other[key]) for key in one)
     # A vector environment stores observations in the type of the space.
     other = np.asarray(other)

@@ -7,15 +7,16 @@ algorithm, so that an idea that adds a network or a counter is saved without a l
 
 What is captured: tensors, modules, optimizers, arrays, numbers, text, containers of these, random
 generators, and objects of the packages that algorithms are made of (replay buffers, noise,
-normalisation). What is not: environments, loggers, functions, spaces apart from their generators.
+normalization). What is not: environments, loggers, functions, spaces apart from their generators.
 """
 
 from __future__ import annotations
 
+import copy
 import random
 import sys
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -26,24 +27,20 @@ from stable_baselines3.common.buffers import BaseBuffer, RolloutBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.distributions import StateDependentNoiseDistribution
 from stable_baselines3.common.vec_env import VecEnv
+from torch.optim.lr_scheduler import LRScheduler
 
 from scilab_rl.errors import CheckpointError
 from scilab_rl.metrics.logger import MetricLogger
 
 Node = Any  # JSON: a plain value, or {"@kind": ...}
+RandomState = dict[str, Any]  # of the global generators
 
 _OPEN_PACKAGES = ("stable_baselines3", "sb3_contrib", "scilab_rl", "custom_algorithms")
-# What a module may keep beside its parameters and buffers: counters, running means, exploration.
+# State of a module other than parameters and buffers: counters, running means, exploration.
 _KEPT_IN_MODULES = (
-    bool,
-    int,
-    float,
-    np.ndarray,
-    torch.Tensor,
-    np.random.Generator,
-    torch.optim.Optimizer,
+    bool, int, float, np.ndarray, torch.Tensor, np.random.Generator, torch.optim.Optimizer,
     StateDependentNoiseDistribution,
-)
+)  # fmt: skip
 _CLOSED = (VecEnv, gym.Env, MetricLogger, BaseCallback, torch.device, torch.dtype, type)
 
 
@@ -61,8 +58,16 @@ class Snapshot:
     tensors: dict[str, torch.Tensor] = field(default_factory=dict)
     arrays: dict[str, np.ndarray] = field(default_factory=dict)
 
+    def copy(self) -> Snapshot:
+        """Return a copy that later steps do not change."""
+        return Snapshot(
+            copy.deepcopy(self.tree),
+            {name: tensor.clone() for name, tensor in self.tensors.items()},
+            {name: array.copy() for name, array in self.arrays.items()},
+        )
 
-def capture(state: dict[str, Any], *, with_buffers: bool = True) -> Snapshot:
+
+def capture(state: Mapping[str, object], *, with_buffers: bool = True) -> Snapshot:
     """Describe named objects.
 
     Args:
@@ -75,7 +80,7 @@ def capture(state: dict[str, Any], *, with_buffers: bool = True) -> Snapshot:
     return snapshot
 
 
-def restore(state: dict[str, Any], snapshot: Snapshot) -> dict[str, Any]:
+def restore(state: Mapping[str, object], snapshot: Snapshot) -> dict[str, Any]:
     """Put a captured state back.
 
     Args:
@@ -99,11 +104,11 @@ def restore(state: dict[str, Any], snapshot: Snapshot) -> dict[str, Any]:
         raise CheckpointError(f"The saved state does not fit this algorithm: {error}") from error
 
 
-def random_state() -> dict[str, Any]:
+def random_state() -> RandomState:
     """Return the state of the global generators of Python, NumPy and PyTorch."""
     version, words, gauss = random.getstate()
     kind, keys, position, has_gauss, cached = np.random.get_state()
-    state: dict[str, Any] = {
+    state: RandomState = {
         "python": [version, list(words), gauss],
         "numpy": [kind, np.asarray(keys), position, has_gauss, cached],
         "torch": torch.get_rng_state(),
@@ -113,7 +118,7 @@ def random_state() -> dict[str, Any]:
     return state
 
 
-def set_random_state(state: dict[str, Any]) -> None:
+def set_random_state(state: RandomState) -> None:
     """Set the global generators to a state from `random_state`."""
     version, words, gauss = state["python"]
     random.setstate((version, tuple(words), gauss))
@@ -123,7 +128,7 @@ def set_random_state(state: dict[str, Any]) -> None:
         torch.cuda.set_rng_state(state["cuda"])
 
 
-def _packages_of(state: dict[str, Any]) -> tuple[str, ...]:
+def _packages_of(state: Mapping[str, object]) -> tuple[str, ...]:
     """Return the packages whose objects are walked into: ours, and the algorithm's own."""
     own = {type(value).__module__.partition(".")[0] for value in state.values()}
     return (*_OPEN_PACKAGES, *(own - {"builtins", "numpy", "torch", "collections"}))
@@ -143,7 +148,7 @@ class _Capture:
         self.packages = packages
         self.seen: set[int] = set()
 
-    def describe(self, value: Any, path: str, rows: Rows | None = None) -> Node:
+    def describe(self, value: object, path: str, rows: Rows | None = None) -> Node:
         """Describe one value; ``rows`` tells how full the replay buffer is that it belongs to."""
         if value is None or isinstance(value, (bool, int, float, str)):
             return value
@@ -165,20 +170,14 @@ class _Capture:
             return self._object(value, path)
         return {"@kind": "skip"}
 
-    def _object_kinds(self) -> list[tuple[Any, Callable[[Any, str], Node]]]:
+    def _object_kinds(self) -> list[tuple[type, Callable[[Any, str], Node]]]:
         return [
             (torch.nn.Module, self._module),
             (torch.optim.Optimizer, self._optimizer),
-            (torch.optim.lr_scheduler.LRScheduler, self._scheduler),
-            (
-                np.random.Generator,
-                lambda g, _: {"@kind": "generator", "state": g.bit_generator.state},
-            ),
-            (
-                torch.Generator,
-                lambda g, path: self._tensor(g.get_state(), path) | {"@kind": "torch_generator"},
-            ),
-            (gym.Space, self._space),
+            (LRScheduler, self._scheduler),
+            (np.random.Generator, self._generator),
+            (torch.Generator, self._torch_generator),
+            (gym.Space, lambda s, path: self._generator(s.np_random, path) | {"@kind": "space"}),
             (BaseBuffer, self._buffer),
         ]
 
@@ -198,13 +197,13 @@ class _Capture:
         self.snapshot.arrays[path] = value[: rows.filled]
         return {"@kind": "rows", "name": path}
 
-    def _container(self, value: Any, path: str, rows: Rows | None) -> Node:
+    def _container(self, value: dict | list | tuple | deque, path: str, rows: Rows | None) -> Node:
         if isinstance(value, dict):
-            entries: Any = {
+            named = {
                 str(key): self.describe(entry, f"{path}.{key}", rows)
                 for key, entry in value.items()
             }
-            return {"@kind": "dict", "entries": entries}
+            return {"@kind": "dict", "entries": named}
         entries = [self.describe(entry, f"{path}.{i}", rows) for i, entry in enumerate(value)]
         return {
             "@kind": type(value).__name__ if not _is_named_tuple(value) else "named_tuple",
@@ -234,11 +233,14 @@ class _Capture:
             "state": self.describe(state["state"], f"{path}.state"),
         }
 
-    def _scheduler(self, scheduler: torch.optim.lr_scheduler.LRScheduler, path: str) -> Node:
+    def _scheduler(self, scheduler: LRScheduler, path: str) -> Node:
         return {"@kind": "scheduler", "state": self.describe(scheduler.state_dict(), path)}
 
-    def _space(self, space: gym.Space, path: str) -> Node:
-        return {"@kind": "space", "state": space.np_random.bit_generator.state}
+    def _generator(self, generator: np.random.Generator, path: str) -> Node:
+        return {"@kind": "generator", "state": generator.bit_generator.state}
+
+    def _torch_generator(self, generator: torch.Generator, path: str) -> Node:
+        return self._tensor(generator.get_state(), path) | {"@kind": "torch_generator"}
 
     def _buffer(self, buffer: BaseBuffer, path: str) -> Node:
         if isinstance(buffer, RolloutBuffer):  # refilled from the start in the next rollout
@@ -248,7 +250,7 @@ class _Capture:
         filled = buffer.buffer_size if buffer.full else buffer.pos
         return self._object(buffer, path, Rows(filled, buffer.buffer_size))
 
-    def _object(self, value: Any, path: str, rows: Rows | None = None) -> Node:
+    def _object(self, value: object, path: str, rows: Rows | None = None) -> Node:
         attributes = {
             name: self.describe(attribute, f"{path}.{name}", rows)
             for name, attribute in vars(value).items()
@@ -261,7 +263,7 @@ class _Restore:
     def __init__(self, snapshot: Snapshot) -> None:
         self.snapshot = snapshot
 
-    def put(self, current: Any, node: Node) -> Any:
+    def put(self, current: object, node: Node) -> Any:
         """Return what belongs in the place of ``current``, changed in place where possible."""
         if not isinstance(node, dict) or "@kind" not in node:
             return node
@@ -270,7 +272,7 @@ class _Restore:
             return current
         return getattr(self, f"_put_{kind}")(current, node)
 
-    def _put_tensor(self, current: Any, node: Node) -> Any:
+    def _put_tensor(self, current: object, node: Node) -> torch.Tensor:
         saved = self.snapshot.tensors[node["name"]]
         if isinstance(current, torch.Tensor):
             if current.shape == saved.shape:
@@ -280,7 +282,7 @@ class _Restore:
                 raise ValueError(f"{node['name']} has shape {_shape(saved)}, not {_shape(current)}")
         return saved.clone()
 
-    def _put_array(self, current: Any, node: Node) -> np.ndarray:
+    def _put_array(self, current: object, node: Node) -> np.ndarray:
         saved = self.snapshot.arrays[node["name"]]
         if isinstance(current, np.ndarray) and current.flags.writeable:
             if (current.shape, current.dtype) == (saved.shape, saved.dtype):
@@ -288,7 +290,7 @@ class _Restore:
                 return current
         return np.array(saved)
 
-    def _put_rows(self, current: Any, node: Node) -> np.ndarray:
+    def _put_rows(self, current: np.ndarray, node: Node) -> np.ndarray:
         """Fill the array in place: a replay buffer is too large to exist twice."""
         saved = self.snapshot.arrays[node["name"]]
         if current.shape[1:] != saved.shape[1:] or len(current) < len(saved):
@@ -296,18 +298,16 @@ class _Restore:
         current[: len(saved)] = saved
         return current
 
-    def _put_dict(self, current: Any, node: Node) -> dict:
-        known = {str(key): key for key in current} if isinstance(current, dict) else {}
-        restored = {
-            known.get(key, key): self.put(current[known[key]] if key in known else None, entry)
+    def _put_dict(self, current: object, node: Node) -> dict:
+        kept = current if isinstance(current, dict) else {}
+        known = {str(key): key for key in kept}
+        kept |= {
+            known.get(key, key): self.put(kept.get(known.get(key, key)), entry)
             for key, entry in node["entries"].items()
         }
-        if isinstance(current, dict):
-            current.update(restored)
-            return current
-        return restored
+        return kept
 
-    def _put_list(self, current: Any, node: Node) -> list:
+    def _put_list(self, current: object, node: Node) -> list:
         olds = list(current) if isinstance(current, list) else []
         olds += [None] * (len(node["entries"]) - len(olds))
         restored = [self.put(old, entry) for old, entry in zip(olds, node["entries"], strict=False)]
@@ -316,7 +316,7 @@ class _Restore:
             return current
         return restored
 
-    def _put_tuple(self, current: Any, node: Node) -> tuple:
+    def _put_tuple(self, current: tuple | None, node: Node) -> tuple:
         return tuple(self._put_list(list(current or ()), node))
 
     def _put_named_tuple(self, current: Any, node: Node) -> Any:
@@ -332,7 +332,7 @@ class _Restore:
             raise ValueError(f"{node['name']} has shape {_shape(saved)}, not {_shape(current)}")
         return jnp.array(saved.numpy(), device=getattr(current, "device", None))
 
-    def _put_deque(self, current: Any, node: Node) -> deque:
+    def _put_deque(self, current: object, node: Node) -> deque:
         restored: deque = deque(maxlen=getattr(current, "maxlen", None))
         restored.extend(self.put(None, entry) for entry in node["entries"])
         return restored
@@ -357,9 +357,7 @@ class _Restore:
         )
         return current
 
-    def _put_scheduler(
-        self, current: torch.optim.lr_scheduler.LRScheduler, node: Node
-    ) -> torch.optim.lr_scheduler.LRScheduler:
+    def _put_scheduler(self, current: LRScheduler, node: Node) -> LRScheduler:
         current.load_state_dict(self.put(None, node["state"]))
         return current
 
@@ -375,7 +373,7 @@ class _Restore:
         current.np_random.bit_generator.state = node["state"]
         return current
 
-    def _put_object(self, current: Any, node: Node) -> Any:
+    def _put_object(self, current: object, node: Node) -> object:
         attributes = vars(current)
         for name, entry in node["attributes"].items():
             if name in attributes:
@@ -383,15 +381,15 @@ class _Restore:
         return current
 
 
-def _shape(value: Any) -> tuple[int, ...]:
+def _shape(value: np.ndarray | torch.Tensor) -> tuple[int, ...]:
     return tuple(value.shape)
 
 
-def _is_jax_array(value: Any) -> bool:
+def _is_jax_array(value: object) -> bool:
     """Tell without importing JAX, which is an optional package."""
     jax = sys.modules.get("jax")
     return jax is not None and isinstance(value, jax.Array)
 
 
-def _is_named_tuple(value: Any) -> bool:
+def _is_named_tuple(value: object) -> bool:
     return isinstance(value, tuple) and hasattr(value, "_fields")

@@ -10,6 +10,7 @@ from stable_baselines3 import HerReplayBuffer
 from scilab_rl.algorithms import actor_critic
 from scilab_rl.algorithms.actor_critic import ACTOR_CRITIC
 from scilab_rl.errors import NumericalError
+from scilab_rl.learning.nn import gradient_step
 
 NETWORKS = ("actor", "critic", "actor_target", "critic_target")
 
@@ -62,8 +63,8 @@ def test_the_actor_climbs_the_critic(make: Any) -> None:
     for _ in range(50):
         batch = model.sample(64)
         actions = model.actor(batch.observations)
-        loss = -actor_critic.q_value(model.critic, batch.observations, actions).mean()
-        actor_critic.descend(model.actor_optimizer, loss)
+        loss = -model.action_values(batch.observations, actions).mean()
+        gradient_step(model.actor_optimizer, loss)
     assert value_of_policy() > before
 
 

@@ -93,7 +93,7 @@ def test_the_interval_counts_steps_of_all_environments(
 ) -> None:
     copies: list[int] = []
     model = make(n_envs=n_envs, target_update_interval=40, train_freq=1)
-    monkeypatch.setattr(cleandqn, "follow", lambda *_: copies.append(model.num_timesteps))
+    monkeypatch.setattr(cleandqn, "update_target", lambda *_: copies.append(model.num_timesteps))
     model.learn(120)
     assert len(copies) == 3
     assert all(step % 40 < n_envs for step in copies)

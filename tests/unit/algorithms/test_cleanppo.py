@@ -9,8 +9,8 @@ import torch
 from gymnasium import spaces
 
 from scilab_rl.algorithms import cleanppo
-from scilab_rl.algorithms.base import Step
 from scilab_rl.algorithms.cleanppo import CLEANPPO
+from scilab_rl.envs.vec_step import VecStep
 from scilab_rl.errors import NumericalError
 
 
@@ -108,9 +108,10 @@ def test_a_rollout_bootstraps_from_the_state_that_a_truncated_episode_reached(ma
     model = make(n_envs=1, gamma=0.5, gae_lambda=0.0)
     first, reached, next_first = (np.full((1, 4), x, np.float32) for x in (0.1, 0.5, -0.9))
     done, not_done = np.array([True]), np.array([False])
+    action, reward = np.zeros((1, 2), np.float32), np.array([1.0])
     steps = [
-        Step(first, reached, np.array([1.0]), done, not_done, [{}]),  # truncated
-        Step(next_first, reached, np.array([1.0]), done, done, [{}]),  # terminated
+        VecStep(first, action, reward, not_done, done, [{}], reached, next_first),  # truncated
+        VecStep(next_first, action, reward, done, not_done, [{}], reached, first),  # terminated
     ]
     rollout = model.make_rollout(steps, torch.zeros(2, 1, 2))
     value = {name: model.value(obs).item() for name, obs in [("f", first), ("r", reached)]}

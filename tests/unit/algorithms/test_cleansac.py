@@ -9,8 +9,9 @@ import torch
 from stable_baselines3 import HerReplayBuffer
 
 from scilab_rl.algorithms import cleansac
-from scilab_rl.algorithms.cleansac import CLEANSAC, Actor, Critics
+from scilab_rl.algorithms.cleansac import CLEANSAC, Actor
 from scilab_rl.errors import NumericalError
+from scilab_rl.learning.nn import gradient_step
 
 
 def column(*values: float) -> torch.Tensor:
@@ -68,12 +69,6 @@ def test_actor_loss_weighs_entropy_against_the_smallest_critic() -> None:
     assert cleansac.actor_loss(column(-2.0, 4.0), q_values, 0.5).item() == pytest.approx(-1.5)
 
 
-def test_variance_of_the_critics_is_the_mean_squared_deviation() -> None:
-    variance = cleansac.critic_variance(torch.tensor([[1.0, 3.0], [2.0, 2.0]]))
-    assert variance.flatten().tolist() == [1.0, 0.0]
-    assert cleansac.critic_variance(torch.tensor([[5.0]])).tolist() == [[0.0]]  # one critic
-
-
 def test_squashed_density_by_hand() -> None:
     # a = tanh(u), u = mu + sigma eps = 0 + 1 * 1: log N(1) - log(1 - tanh(1)^2)
     noise = torch.tensor([[1.0]])
@@ -104,21 +99,6 @@ def test_density_of_a_drawn_action_is_the_density_of_that_action() -> None:
         torch.testing.assert_close(
             actor.log_prob(observations, actions), log_prob, atol=1e-3, rtol=1e-3
         )
-
-
-def test_batched_critics_equal_separate_networks() -> None:
-    torch.manual_seed(0)
-    critics = Critics(n_observations=3, n_actions=2, net_arch=[5, 4], n_critics=3)
-    observations, actions = torch.randn(7, 3), torch.randn(7, 2)
-    together = critics(observations, actions)
-    assert together.shape == (7, 3)
-    for index in range(3):
-        hidden = torch.cat([observations, actions], dim=1)
-        for layer, (weight, bias) in enumerate(zip(critics.weights, critics.biases, strict=True)):
-            hidden = hidden @ weight[index] + bias[index]
-            hidden = hidden.relu() if layer < 2 else hidden
-        torch.testing.assert_close(together[:, index], hidden.squeeze(1))
-    assert not torch.equal(together[:, 0], together[:, 1])
 
 
 def test_bfloat16_is_for_matrix_products_alone(make: Any) -> None:
@@ -188,21 +168,13 @@ def test_a_fixed_entropy_coefficient_stays(make: Any) -> None:
     assert model.ent_coef.item() == pytest.approx(0.3)
 
 
-def test_targets_follow_by_tau() -> None:
-    target, source = torch.nn.Linear(1, 1), torch.nn.Linear(1, 1)
-    torch.nn.init.constant_(target.weight, 1.0)
-    torch.nn.init.constant_(source.weight, 3.0)
-    cleansac.follow(target, source, tau=0.25)
-    assert target.weight.item() == 1.5
-
-
 def test_descending_touches_the_optimizers_own_parameters_only(make: Any) -> None:
     model = make()
     critic = weights(model.critic)
     observations = torch.ones(4, model.n_observations)
     actions, log_prob = model.actor.sample(observations)
     loss = cleansac.actor_loss(log_prob, model.critic(observations, actions), 0.1)
-    cleansac.descend(model.actor_optimizer, loss)
+    gradient_step(model.actor_optimizer, loss)
     assert all(parameter.grad is None for parameter in model.critic.parameters())
     assert all(map(torch.equal, critic, weights(model.critic)))
     assert all(parameter.grad is not None for parameter in model.actor.parameters())
@@ -267,7 +239,7 @@ def test_what_is_recorded(make: Any) -> None:
     assert set(values) == {
         "train/actor_loss",
         "train/critic_loss",
-        "train/critic_variance",
+        "train/target_critic_variance",
         "train/ent_coef",
         "train/ent_coef_loss",
         "train/rollout_q_step",
@@ -321,6 +293,6 @@ def test_a_finite_loss_does_not_hide_a_weight_that_is_not(
                 next(model.actor.parameters()).fill_(float("inf"))
         return loss.detach()
 
-    monkeypatch.setattr(cleansac, "descend", poison)
+    monkeypatch.setattr(cleansac, "gradient_step", poison)
     with pytest.raises(NumericalError, match=r"actor\.net\.0\.weight is inf at update 2"):
         model.train(1)

@@ -13,9 +13,9 @@ jax = pytest.importorskip("jax")
 import jax.numpy as jnp  # noqa: E402
 
 from scilab_rl.algorithms import cleansac, jaxsac  # noqa: E402
-from scilab_rl.algorithms.jax_engine import Batch  # noqa: E402
 from scilab_rl.algorithms.jaxsac import JAXSAC, Settings  # noqa: E402
-from scilab_rl.algorithms.replay import HindsightReplayBuffer  # noqa: E402
+from scilab_rl.learning.jax_engine import Batch, dense_layers  # noqa: E402
+from scilab_rl.learning.replay import HindsightReplayBuffer  # noqa: E402
 from scilab_rl.metrics.logger import MetricLogger  # noqa: E402
 
 N_OBSERVATIONS, N_ACTIONS, BATCH = 5, 2, 8
@@ -39,8 +39,9 @@ def settings(**changed: Any) -> Settings:
 
 def a_state(n_critics: int = 2) -> Any:
     np.random.seed(4)
-    sizes = (N_OBSERVATIONS, N_ACTIONS, [6])
-    state = jaxsac.initial_state(*sizes, n_critics, False, 0.3, 0.1)
+    actor = dense_layers([N_OBSERVATIONS, 6, 2 * N_ACTIONS])
+    critic = dense_layers([N_OBSERVATIONS + N_ACTIONS, 6, 1], n=n_critics)
+    state = jaxsac.initial_state(actor, critic, 0.3, 0.1)
     return jax.tree.map(jnp.array, state)
 
 
@@ -200,7 +201,7 @@ def test_metrics_and_answers(make: Any) -> None:
     model.set_logger(MetricLogger())
     model.learn(60)
     recorded = model.logger.name_to_value
-    names = "critic_loss actor_loss ent_coef ent_coef_loss q_mean critic_variance".split()
+    names = "critic_loss actor_loss ent_coef ent_coef_loss q_mean target_critic_variance".split()
     assert {f"train/{name}" for name in names} <= set(recorded)
     observations = model.get_env().reset()
     actions, _ = model.predict(observations, deterministic=True)

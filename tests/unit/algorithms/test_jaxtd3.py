@@ -10,9 +10,9 @@ jax = pytest.importorskip("jax")
 import jax.numpy as jnp  # noqa: E402
 
 from scilab_rl.algorithms import jaxtd3  # noqa: E402
-from scilab_rl.algorithms.jax_engine import Batch  # noqa: E402
 from scilab_rl.algorithms.jaxtd3 import JAXTD3, Settings  # noqa: E402
-from scilab_rl.algorithms.replay import HindsightReplayBuffer  # noqa: E402
+from scilab_rl.learning.jax_engine import Batch  # noqa: E402
+from scilab_rl.learning.replay import HindsightReplayBuffer  # noqa: E402
 
 KEY = jax.random.key(0)
 
@@ -77,7 +77,7 @@ def test_target_noise_is_clipped() -> None:
 
 def test_critic_loss_is_the_squared_error_of_each_critic() -> None:
     # Q_1 = 3 * 2 + 0.5 = 6.5, Q_2 = 2 + 1 = 3; (6.5 - 1)^2 + (3 - 1)^2 = 34.25
-    loss, q = jaxtd3.critic_loss(linear([3.0, 1.0], [1.0, 2.0]), batch(), np.ones(1), "float32")
+    loss, q = jaxtd3.squared_error(linear([3.0, 1.0], [1.0, 2.0]), batch(), np.ones(1), "float32")
     assert q[:, 0].tolist() == [6.5, 3.0]
     assert float(loss) == pytest.approx(34.25)
 

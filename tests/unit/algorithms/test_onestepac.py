@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from scilab_rl.algorithms import onestepac
-from scilab_rl.algorithms.base import Step
 from scilab_rl.algorithms.onestepac import ONESTEPAC
+from scilab_rl.envs.vec_step import VecStep
 from scilab_rl.errors import NumericalError
 
 
@@ -26,15 +26,17 @@ def weights(model: ONESTEPAC) -> list[torch.Tensor]:
     return [p.detach().clone() for module in modules for p in module.parameters()]
 
 
-def step_to(dones: list[bool], terminated: list[bool], reward: float = 1.0) -> Step:
+def step_to(dones: list[bool], terminated: list[bool], reward: float = 1.0) -> VecStep:
     n = len(dones)
     observations = np.full((n, 2), 0.3, np.float32)
     next_observations = np.full((n, 2), -0.4, np.float32)
     rewards = np.full(n, reward)
     infos: list[dict[str, Any]] = [{} for _ in range(n)]
-    return Step(
-        observations, next_observations, rewards, np.array(dones), np.array(terminated), infos
-    )
+    truncated = np.array(dones) & ~np.array(terminated)
+    return VecStep(
+        observations, np.zeros(n), rewards, np.array(terminated), truncated, infos,
+        next_observations, observations,
+    )  # fmt: skip
 
 
 def test_target_by_hand() -> None:

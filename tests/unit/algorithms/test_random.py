@@ -9,6 +9,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from scilab_rl.algorithms.random import RANDOM
+from scilab_rl.canonical_spaces import conversions, with_canonical_spaces
 
 
 class AnyActions(gym.Env):
@@ -22,7 +23,7 @@ class AnyActions(gym.Env):
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> Any:
-        assert self.action_space.contains(action)
+        assert self.action_space.contains(np.asarray(action))
         return np.zeros(1, np.float32), 0.0, False, False, {}
 
 
@@ -30,22 +31,27 @@ SPACES = [
     spaces.Box(np.float32([-3.0, 1.0]), np.float32([-2.0, 5.0])),
     spaces.Discrete(4, start=3),
     spaces.MultiDiscrete([2, 5]),
+    spaces.MultiDiscrete([[2, 3], [2, 3]], start=[[1, 1], [0, -4]]),
+    spaces.Box(-128, 127, (2,), np.int8),
+    spaces.Box(0, 0.25, (), np.float16),
     spaces.MultiBinary(3),
 ]
 
 
 def make(space: spaces.Space, n_envs: int = 2) -> RANDOM:
-    return RANDOM(env=DummyVecEnv([lambda: AnyActions(space)] * n_envs), seed=4, device="cpu")
+    env = with_canonical_spaces(DummyVecEnv([lambda: AnyActions(space)] * n_envs))
+    return RANDOM(env=env, seed=4, device="cpu")
 
 
-@pytest.mark.parametrize("space", SPACES, ids=lambda space: type(space).__name__)
+@pytest.mark.parametrize("space", SPACES, ids=str)
 def test_actions_of_any_kind_are_in_the_space(space: spaces.Space) -> None:
     model = make(space).learn(20)
     assert model.num_timesteps == 20
     batch, _ = model.predict(np.zeros((30, 1), np.float32), deterministic=True)
     assert len(batch) == 30
+    batch = conversions(model.get_env())[0].to_env(batch)
     for action in batch:
-        assert space.contains(action.astype(space.dtype) if space.shape else int(action))
+        assert space.contains(np.asarray(action, space.dtype))
     assert len(np.unique(batch, axis=0)) > 3
 
 

@@ -62,7 +62,7 @@ def test_rewards_are_mixed_as_in_the_paper(make: Any, monkeypatch: pytest.Monkey
     # -0.75 + 0.0625;  -0.75 + 0 + 0.5 * 2;  0 + 0.25 + 0.5 * 0
     torch.testing.assert_close(targets, column(-0.6875, 0.25, 0.25))
     recorded = model.logger.take()
-    assert recorded["train/critic_variance"] == pytest.approx(5 / 3)
+    assert recorded["train/target_critic_variance"] == pytest.approx(5 / 3)
     assert recorded["train/intrinsic_reward"] == pytest.approx(1.25 / 3)
 
 

@@ -79,7 +79,7 @@ def test_gripper_moves_by_the_action() -> None:
 
 def test_rendering_does_not_change_the_episode(monkeypatch) -> None:
     from scilab_rl.errors import RenderingError
-    from scilab_rl.visualization.gl import choose_backend
+    from scilab_rl.recording.gl import choose_backend
 
     try:
         choose_backend()

@@ -11,10 +11,11 @@ import pytest
 
 pytest.importorskip("coppeliasim_zmqremoteapi_client")
 
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.envs.checker import check_environment
 from scilab_rl.envs.coppeliasim_tasks import CoppeliaDrive, CoppeliaReach
-from scilab_rl.envs.examination import examine
-from scilab_rl.envs.vectorize import EnvSettings, make_single_env
-from scilab_rl.errors import ConfigError, EnvironmentError_
+from scilab_rl.envs.vectorize import make_single_env
+from scilab_rl.errors import ConfigError, EnvironmentFailure
 from tests.stand_ins.coppeliasim_server import StandIn
 
 N_SIMULATORS = 3
@@ -81,8 +82,8 @@ def test_the_pillar_stops_the_robot(stand_ins) -> None:
 
 @pytest.mark.parametrize("env_id", ["CoppeliaReach-v0", "CoppeliaDrive-v0"])
 def test_the_doctor_finds_no_fault(stand_ins, env_id) -> None:
-    settings = EnvSettings(env_id, {"port": stand_ins[0].port})
-    found = list(examine(lambda: make_single_env(settings), n_steps=200))
+    settings = RunConfig(env_id, {"port": stand_ins[0].port})
+    found = list(check_environment(lambda: make_single_env(settings), n_steps=200))
     assert [f for f in found if f.result in ("warn", "fail")] == []
     assert len(found) == 16
 
@@ -116,7 +117,7 @@ def test_no_simulator_says_how_to_start_one(monkeypatch) -> None:
     monkeypatch.delenv("COPPELIASIM_ROOT", raising=False)
     port = free_port()
     message = rf"No CoppeliaSim at localhost:{port} answers.*rpcPort={port}.*COPPELIASIM_ROOT"
-    with pytest.raises(EnvironmentError_, match=message):
+    with pytest.raises(EnvironmentFailure, match=message):
         CoppeliaReach(port=port, timeout_seconds=0.3)
 
 
@@ -124,7 +125,7 @@ def test_wrong_folders_and_scenes_are_named(stand_ins, monkeypatch, tmp_path) ->
     with pytest.raises(ConfigError, match=r"there is no file 'nowhere\.ttt'"):
         CoppeliaReach(port=stand_ins[0].port, scene="nowhere.ttt")
     monkeypatch.setenv("COPPELIASIM_ROOT", str(tmp_path))
-    with pytest.raises(EnvironmentError_, match=r"has no coppeliaSim\.sh"):
+    with pytest.raises(EnvironmentFailure, match=r"has no coppeliaSim\.sh"):
         CoppeliaReach(port=free_port(), timeout_seconds=0.3)
 
 
@@ -132,7 +133,7 @@ def test_a_simulator_that_dies_is_reported_and_the_port_is_freed(stand_ins) -> N
     env = CoppeliaReach(port=stand_ins[0].port, timeout_seconds=0.5)
     env.reset(seed=0)
     stand_ins[0].mute = True
-    with pytest.raises(EnvironmentError_, match=r"has not answered for 0\.5 s"):
+    with pytest.raises(EnvironmentFailure, match=r"has not answered for 0\.5 s"):
         env.step(np.zeros(3))
     env.close()
     stand_ins[0].mute = False
@@ -162,5 +163,5 @@ def test_a_simulator_is_started_and_ended(monkeypatch, tmp_path) -> None:
 @pytest.mark.skipif("COPPELIASIM_ROOT" not in os.environ, reason="needs the real simulator")
 @pytest.mark.parametrize("cls", [CoppeliaReach, CoppeliaDrive])
 def test_the_real_simulator(cls) -> None:
-    found = list(examine(lambda: cls(render_mode="rgb_array"), n_steps=100))
+    found = list(check_environment(lambda: cls(render_mode="rgb_array"), n_steps=100))
     assert [f for f in found if f.result == "fail"] == []

@@ -61,9 +61,10 @@ def test_it_ignores_the_last_bits():
 
 
 def test_fetch_has_the_known_good_one():
-    from scilab_rl.envs.vectorize import EnvSettings, make_single_env
+    from scilab_rl.config.schema import RunConfig
+    from scilab_rl.envs.vectorize import make_single_env
 
-    one, two = (make_single_env(EnvSettings("FetchReach-v4")) for _ in range(2))
+    one, two = (make_single_env(RunConfig("FetchReach-v4")) for _ in range(2))
     assert fingerprint(one) == fingerprint(two)
 
 

@@ -19,19 +19,19 @@ class Line(GoalEnv):
         self.start = start
         super().__init__(**kwargs)
 
-    def restart(self) -> None:
+    def reset_state(self) -> None:
         self.place = np.array([self.start])
 
     def sample_goal(self) -> np.ndarray:
         return self.np_random.uniform(-1, 1, 1)
 
-    def apply(self, action: np.ndarray) -> None:
+    def apply_action(self, action: np.ndarray) -> None:
         self.place += 0.1 * action
 
     def achieved_goal(self) -> np.ndarray:
         return self.place
 
-    def observe(self) -> np.ndarray:
+    def get_observation(self) -> np.ndarray:
         return self.place
 
 

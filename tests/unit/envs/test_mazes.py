@@ -1,10 +1,12 @@
 from __future__ import annotations
 
+import itertools
+
 import gymnasium as gym
 import numpy as np
 import pytest
 
-from scilab_rl.envs.mazes import MAPS, AntMaze, PointMaze, PointObjMaze, cell_centres
+from scilab_rl.envs.mazes import MAPS, AntMaze, PointMaze, PointObjMaze, cell_centers
 from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.errors import ConfigError
 
@@ -19,6 +21,49 @@ def test_long_ids_give_every_option() -> None:
     env = point.unwrapped
     assert (env.n_objects, env.threshold, env.reset_target) == (4, 0.5, True)
     assert len(env.starts) == 15
+
+
+AGENTS = {"PointGym": "", "PointObjGym": "-o2", "AntGym": "-10"}
+REWARDS = ("sparse", "sparseneg", "dense")
+
+
+@pytest.mark.parametrize("agent", AGENTS)
+def test_every_long_id_of_the_reference_names_a_maze(agent: str) -> None:
+    """All words of the grammar; each way to continue is also made."""
+    endings = list(itertools.product(REWARDS, MAPS, (0, 1), (0, 1)))
+    for number, (reward, maze_map, continuing, reset) in enumerate(endings):
+        given = f"{agent}-{reward}{AGENTS[agent]}-1.5-{maze_map}-c{continuing}-rt{reset}-s300-v0"
+        found, notice = resolve_env_id(given)
+        kwargs = gym.spec(found).kwargs
+        assert (found, gym.spec(found).max_episode_steps) == (given, 300)
+        assert kwargs["continuing"] is bool(continuing)
+        assert kwargs["reset_target"] is bool(continuing and reset)
+        assert notice and f"reset_target={bool(continuing and reset)}" in notice
+        if number % 23 == 0 or (reward, maze_map) == ("sparseneg", "small_open_dgr"):
+            env = gym.make(found)
+            env.reset(seed=1)
+            env.step(env.action_space.sample())
+            env.close()
+
+
+def test_the_id_that_was_refused() -> None:
+    found, _ = resolve_env_id("AntGym-sparseneg-10-1.5-small_open_dgr-c0-rt1-s300-v0")
+    env = gym.make(found)
+    assert env.unwrapped.terminate_on_success and not env.unwrapped.reset_target
+
+
+@pytest.mark.parametrize("threshold", ["1", "0.50", ".5", "2."])
+def test_thresholds_are_numbers(threshold: str) -> None:
+    found, _ = resolve_env_id(f"PointGym-sparse-{threshold}-open_dgr-c1-rt0-s10-v0")
+    assert gym.make(found).unwrapped.threshold == float(threshold)
+
+
+@pytest.mark.parametrize("reset_target", [False, True])
+def test_a_threshold_that_leaves_no_goal_is_refused(reset_target: bool) -> None:
+    """It would be looked for without end."""
+    with pytest.raises(ConfigError, match="too large for this map"):
+        PointMaze("small_open_dgr", threshold=4.0, reset_target=reset_target)
+    PointMaze("small_open_dgr", threshold=1.5, reset_target=reset_target).reset(seed=1)
 
 
 @pytest.mark.parametrize("wrong", ["PointGym-sparse-0.5-big-c1-rt0-s500-v0", "AntGym-sparse-v0"])
@@ -36,9 +81,9 @@ def test_rewards_by_hand() -> None:
 
 
 def test_cells_are_where_the_map_shows_them() -> None:
-    assert cell_centres(("#r#", "#.g"), "r", 2.0).tolist() == [[0.0, 1.0]]
-    assert cell_centres(("#r#", "#.g"), "g", 2.0).tolist() == [[2.0, -1.0]]
-    assert len(cell_centres(MAPS["open"], "rc", 1.0)) == 15
+    assert cell_centers(("#r#", "#.g"), "r", 2.0).tolist() == [[0.0, 1.0]]
+    assert cell_centers(("#r#", "#.g"), "g", 2.0).tolist() == [[2.0, -1.0]]
+    assert len(cell_centers(MAPS["open"], "rc", 1.0)) == 15
 
 
 @pytest.mark.parametrize("maze_map", list(MAPS))

@@ -4,9 +4,11 @@ import pytest
 from gymnasium import spaces
 from stable_baselines3.common.vec_env import DummyVecEnv
 
-from scilab_rl.envs.observed import ObservedVecEnv, success_of
-from scilab_rl.envs.vectorize import EnvSettings, make_train_env, observed_layer
-from scilab_rl.errors import EnvironmentError_, NumericalError
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.vectorize import make_train_env, observed_layer
+from scilab_rl.errors import EnvironmentFailure, NumericalError
+from scilab_rl.metrics.success import success_of
 from scilab_rl.testing.environments import TinyReach
 
 BAD = [float("nan"), float("inf"), float("-inf")]
@@ -62,7 +64,7 @@ def act(env, n):
 def test_an_observation_that_is_no_number_is_refused(key, value, at_step):
     env, seen = observed(key, value, at_step=at_step), []
     env.observers.append(Collecting(seen))
-    with pytest.raises(EnvironmentError_) as error:
+    with pytest.raises(EnvironmentFailure) as error:
         act(env, 5)
     message = str(error.value)
     assert message.startswith(
@@ -77,14 +79,14 @@ def test_an_observation_that_is_no_number_is_refused(key, value, at_step):
 def test_a_reward_that_is_no_number_is_refused(value):
     env = observed("reward", value)
     with pytest.raises(
-        EnvironmentError_, match=r"Tiny: reward is .* of environment 1 after step 4"
+        EnvironmentFailure, match=r"Tiny: reward is .* of environment 1 after step 4"
     ):
         act(env, 5)
 
 
 @pytest.mark.parametrize("value", BAD)
 def test_the_last_observation_of_an_episode_is_checked_too(value):
-    with pytest.raises(EnvironmentError_, match="observation 'observation' is"):
+    with pytest.raises(EnvironmentFailure, match="observation 'observation' is"):
         act(observed("last observation", value), 5)
 
 
@@ -99,17 +101,17 @@ def test_an_action_that_is_no_number_never_reaches_the_simulator(value):
 @pytest.mark.parametrize("call", ["reset", "step"])
 def test_what_an_environment_raises_is_named(call):
     env = observed(f"raise in {call}")
-    with pytest.raises(EnvironmentError_, match=rf"Tiny raised ValueError in {call}\(\) at train"):
+    with pytest.raises(EnvironmentFailure, match=rf"Tiny raised ValueError in {call}\(\) at train"):
         act(env, 5)
 
 
 def test_errors_of_the_framework_pass_as_they_are():
     class Broken(TinyReach):
         def step(self, action):
-            raise EnvironmentError_("mine")
+            raise EnvironmentFailure("mine")
 
     env = ObservedVecEnv(DummyVecEnv([Broken]), "train", "Tiny")
-    with pytest.raises(EnvironmentError_, match=r"^mine$"):
+    with pytest.raises(EnvironmentFailure, match=r"^mine$"):
         act(env, 1)
 
 
@@ -122,7 +124,7 @@ class Collecting:
 
 
 def observed_tiny(env_id="TinyPixels-v0", n_envs=1):
-    env = make_train_env(EnvSettings(f"scilab_rl.testing:{env_id}", n_envs=n_envs))
+    env = make_train_env(RunConfig(f"scilab_rl.testing:{env_id}", n_envs=n_envs, seed=1))
     batches = []
     observed_layer(env).observers.append(Collecting(batches))
     return env, batches
@@ -143,10 +145,10 @@ def test_observers_see_every_step_with_its_number_and_episode():
         assert batch.observations[0].tolist() == [episode, step]
         assert batch.rewards[0] == pytest.approx(episode + (step + 1) / 100)
         after = [episode + 1, 0] if step == 9 else [episode, step + 1]
-        assert batch.next_observations[0].tolist() == after
-        assert batch.dones.tolist() == [step == 9] * 2
-        if step == 9:
-            assert batch.infos[0]["terminal_observation"].tolist() == [episode, 10]
+        assert batch.next_observations[0].tolist() == [episode, step + 1]
+        assert batch.reset_observations[0].tolist() == after
+        assert batch.dones.tolist() == batch.truncated.tolist() == [step == 9] * 2
+        assert not batch.terminated.any()
 
 
 def test_a_reset_drops_the_running_episode():

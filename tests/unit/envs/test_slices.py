@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from scilab_rl.envs.examination import examine
+from scilab_rl.envs.checker import check_environment
 from scilab_rl.envs.slices import GoalFromSlices
 from scilab_rl.errors import ConfigError
 from scilab_rl.testing.environments import TinyBox
@@ -39,7 +39,7 @@ def test_rewards_of_a_batch_by_hand() -> None:
 
 def test_the_doctor_finds_no_fault() -> None:
     limited = lambda: gym.wrappers.TimeLimit(make(), 30)  # noqa: E731
-    found = [finding for finding in examine(limited, n_steps=300)]
+    found = [finding for finding in check_environment(limited, n_steps=300)]
     assert [f for f in found if f.result == "fail"] == []
     assert "rewards of a batch" in {finding.check for finding in found}
 

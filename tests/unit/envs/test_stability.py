@@ -6,7 +6,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from scilab_rl.envs.blocks import Blocks
-from scilab_rl.envs.examination import examine
+from scilab_rl.envs.checker import check_environment
 from scilab_rl.envs.frames import simulator_state
 from scilab_rl.envs.goal import GoalEnv
 from scilab_rl.envs.observed import ObservedVecEnv
@@ -17,15 +17,15 @@ from scilab_rl.training.instability import InstabilityRecord
 class Exploding(Blocks):
     """At its third step the block is shot away at 10^12 m/s."""
 
-    def restart(self) -> None:
+    def reset_state(self) -> None:
         self.n_steps = 0
-        super().restart()
+        super().reset_state()
 
-    def apply(self, action: np.ndarray) -> None:
+    def apply_action(self, action: np.ndarray) -> None:
         self.n_steps += 1
         if self.n_steps == 3:
             self.data.qvel[-3] = 1e12
-        super().apply(action)
+        super().apply_action(action)
 
 
 def test_f11_silent_reset_ends_the_episode_and_is_counted(tmp_path, monkeypatch, caplog) -> None:
@@ -76,14 +76,14 @@ def test_f11_a_run_counts_unstable_episodes_and_writes_what_led_to_them(tmp_path
 def test_other_simulators_are_left_alone() -> None:
     class Dot(GoalEnv):
         action_size = 1
-        restart = apply = lambda self, *_: None
-        sample_goal = achieved_goal = observe = lambda self: np.zeros(1)
+        reset_state = apply_action = lambda self, *_: None
+        sample_goal = achieved_goal = get_observation = lambda self: np.zeros(1)
 
     env = Dot()
     assert guard(env) is env
 
 
 def test_the_doctor_counts_it() -> None:
-    found = {finding.check: finding for finding in examine(Exploding, n_steps=12)}
+    found = {finding.check: finding for finding in check_environment(Exploding, n_steps=12)}
     assert found["stability"].result == "warn"
     assert "unstable 4 times" in found["stability"].found

@@ -66,5 +66,4 @@ def test_the_store_keeps_rows_as_they_were():
     assert store.series("a") == [1.0]
     assert store.latest("a") == 1.0
     assert store.latest("c") is None
-    assert store.names() == ["a", "b"]
     assert (len(store), store.steps) == (2, [10, 20])

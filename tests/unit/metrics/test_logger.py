@@ -5,6 +5,7 @@ import pytest
 import torch
 from stable_baselines3.common.logger import Figure
 
+from scilab_rl.errors import AlgorithmError
 from scilab_rl.metrics.logger import MetricLogger, as_number
 
 
@@ -72,3 +73,11 @@ def test_a_dump_of_the_algorithm_ends_no_epoch():
     logger.record("a", 1.0)
     logger.dump(100)
     assert logger.take() == {"a": 1.0}
+
+
+@pytest.mark.parametrize("name", ["epoch", "step", "kind"])
+def test_a_metric_cannot_replace_a_column_that_describes_the_row(name):
+    logger = MetricLogger()
+    logger.record(name, 5)
+    with pytest.raises(AlgorithmError, match=f"as in train/{name}"):
+        logger.take()

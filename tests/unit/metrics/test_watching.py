@@ -6,6 +6,7 @@ import pytest
 from scilab_rl.errors import ConfigError
 from scilab_rl.metrics.events import EpisodeEvents
 from scilab_rl.metrics.logger import MetricLogger
+from scilab_rl.metrics.probes import Curve
 from scilab_rl.metrics.triggers import parse_trigger
 
 
@@ -67,10 +68,10 @@ def test_goals_that_are_no_places_in_space_cannot_fall() -> None:
 
 def test_trigger_on_a_number_and_on_a_percentile() -> None:
     seen = np.arange(101.0)
-    assert parse_trigger("q > 5").score({"q": 7.5}, [], seen) == 2.5
-    assert parse_trigger("q < -1").score({"q": -3.0}, [], seen) == 2.0
-    assert parse_trigger("q > p90").score({"q": 95.0}, [], seen) == pytest.approx(5.0)
-    assert parse_trigger("q > p90").score({"q": 90.0}, [], seen) is None
+    assert parse_trigger("q > 5").score({Curve("q"): 7.5}, [], seen) == 2.5
+    assert parse_trigger("q < -1").score({Curve("q"): -3.0}, [], seen) == 2.0
+    assert parse_trigger("q > p90").score({Curve("q"): 95.0}, [], seen) == pytest.approx(5.0)
+    assert parse_trigger("q > p90").score({Curve("q"): 90.0}, [], seen) is None
     assert parse_trigger("q > 5").score({}, [], seen) is None
 
 
@@ -82,5 +83,5 @@ def test_trigger_on_an_event() -> None:
 
 @pytest.mark.parametrize("text", ["succes", "q >", "q > p101", "q >> 3", "> 4", "q > x"])
 def test_what_is_no_trigger(text: str) -> None:
-    with pytest.raises(ConfigError, match="is no condition"):
+    with pytest.raises(ConfigError, match="is not a condition"):
         parse_trigger(text)

@@ -5,16 +5,20 @@ import textwrap
 
 import pytest
 
+from scilab_rl.config.schema import AlgorithmConfig, RunConfig
 from scilab_rl.results import RunResult
-from scilab_rl.tracking.base import RunInfo
+from scilab_rl.tracking.base import TrackedRun
 
 
-def run_info(base, name="run", **facts):
+def run_info(base, name="run", arguments=None, resumed_step=None, **facts):
     """A run as it is when trackers hear of it: its directory exists."""
     directory = base / "2026-01-02" / name
     directory.mkdir(parents=True, exist_ok=True)
-    facts = {"env": "TinyReach-v0", "algorithm": "sac", "seed": 7, **facts}
-    return RunInfo(run_dir=directory, base_logdir=base, total_steps=20, n_epochs=2, **facts)
+    cfg = RunConfig(
+        env="TinyReach-v0", seed=7, eval_after_n_steps=10, n_epochs=2, base_logdir=str(base),
+        algorithm=AlgorithmConfig("sac", "stable_baselines3.SAC", arguments or {}), **facts,
+    )  # fmt: skip
+    return TrackedRun(cfg, directory, resumed_step)
 
 
 def result(status="finished"):

@@ -17,10 +17,13 @@ COURSE = """
     import time
     from pathlib import Path
     from scilab_rl.results import RunResult
-    from scilab_rl.tracking.base import RunInfo
+    from scilab_rl.config.schema import AlgorithmConfig, RunConfig
+    from scilab_rl.tracking.base import TrackedRun
     from scilab_rl.tracking.console import ConsoleTracker
     tracker = ConsoleTracker()
-    tracker.begin(RunInfo(Path("data/run"), Path("data"), "TinyReach-v0", "sac", 7, 2000, 2))
+    sac = AlgorithmConfig("sac")
+    cfg = RunConfig("TinyReach-v0", seed=7, eval_after_n_steps=1000, n_epochs=2, algorithm=sac)
+    tracker.begin(TrackedRun(cfg, Path("data/run")))
     for step in range(1, 1001):
         tracker.step(step)
         time.sleep(0.0005)

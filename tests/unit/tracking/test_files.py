@@ -5,7 +5,7 @@ import os
 import pytest
 
 from scilab_rl.errors import ScilabRLError
-from scilab_rl.results import RunDirectory, read_epochs
+from scilab_rl.run.directory import RunDirectory, read_epochs
 from scilab_rl.tracking.files import FilesTracker
 
 from .conftest import result, run_info

@@ -21,13 +21,16 @@ ONE_RUN = """
     note = {"socket.connect": connected.append}
     sys.addaudithook(lambda event, args: note.get(event, len)(args))
     from scilab_rl.results import RunResult
-    from scilab_rl.tracking.base import RunInfo
+    from scilab_rl.config.schema import AlgorithmConfig, RunConfig
+    from scilab_rl.tracking.base import TrackedRun
     from scilab_rl.tracking.mlflow import MLflowTracker
     base, name = Path(sys.argv[1]), sys.argv[2]
     folder = base / "2026-01-02" / name
     folder.mkdir(parents=True)
     tracker = MLflowTracker()
-    tracker.begin(RunInfo(folder, base, "TinyReach-v0", "sac", 7, 20, 2, {"seed": 7}))
+    sac = AlgorithmConfig("sac")
+    cfg = RunConfig("TinyReach-v0", base_logdir=str(base), seed=7, n_epochs=2, algorithm=sac)
+    tracker.begin(TrackedRun(cfg, folder))
     tracker.epoch(10, 1, {"eval/mean_reward": -1.0})
     tracker.end(RunResult("finished", 0.5, 2, 20, 3.0, str(folder)))
     print("connected", connected)
@@ -49,9 +52,9 @@ def started(database, request):
     """A tracker with an open run."""
     from scilab_rl.tracking.mlflow import MLflowTracker
 
-    parameters = {"algorithm.gamma": 0.9, "long": "x" * 7000, "odd[name]": None}
-    parameters |= {f"p{i}": i for i in range(150)}
-    facts = {"parameters": parameters, "tags": ("mine",), "group": "g", "notes": "a note"}
+    arguments = {"gamma": 0.9, "long": "x" * 7000, "odd[name]": None}
+    arguments |= {f"p{i}": i for i in range(150)}
+    facts = {"arguments": arguments, "tags": ("mine",), "group": "g", "info": "a note"}
     run = run_info(database, request.node.name, **facts)
     tracker = MLflowTracker()
     tracker.begin(run)
@@ -65,13 +68,13 @@ def stored(tracker):
 def test_a_run_has_name_tags_and_all_parameters(started):
     tracker, run = started
     data = stored(tracker).data
-    assert stored(tracker).info.run_name == run.name
+    assert stored(tracker).info.run_name == f"{run.cfg.algorithm.name} s{run.cfg.seed} {run.name}"
     assert (data.tags["mine"], data.tags["group"]) == ("true", "g")
     assert data.tags["mlflow.note.content"] == "a note"
     assert data.params["algorithm.gamma"] == "0.9"
-    assert data.params["odd_name_"] == "None"
-    assert len(data.params["long"]) == 6000
-    assert len(data.params) == 153
+    assert data.params["algorithm.odd_x5b_name_x5d_"] == "None"
+    assert len(data.params["algorithm.long"]) == 6000
+    assert len(data.params) == len(run.parameters) > 153
 
 
 def test_runs_of_a_group_are_shown_below_one_run(started):
@@ -92,7 +95,7 @@ def test_an_epoch_is_one_batch_at_its_step(started):
     history = tracker._client.get_metric_history(tracker._run_id, "eval/mean_reward")
     assert [(metric.step, metric.value) for metric in history] == [(10, -1.5), (20, -0.5)]
     metrics = stored(tracker).data.metrics
-    assert metrics["a_0_"] == 2.0
+    assert metrics["a_x5b_0_x5d_"] == 2.0
     assert metrics["train/loss"] != metrics["train/loss"]
 
 
@@ -109,7 +112,7 @@ def test_a_file_lands_beside_the_database(started, database, tmp_path):
     ("status", "expected"),
     [
         ("finished", "FINISHED"),
-        ("stopped_early", "FINISHED"),
+        ("solved", "FINISHED"),
         ("failed", "FAILED"),
         ("interrupted", "KILLED"),
     ],
@@ -142,7 +145,7 @@ def test_a_run_id_that_the_database_does_not_know_begins_anew(database):
     (run.run_dir / "mlflow_run_id.txt").write_text("0" * 32)
     tracker = MLflowTracker()
     tracker.begin(run)
-    assert stored(tracker).info.run_name == "moved_here"
+    assert stored(tracker).info.run_name.endswith(" moved_here")
     assert (run.run_dir / "mlflow_run_id.txt").read_text() == tracker._run_id
 
 
@@ -158,8 +161,8 @@ def test_two_processes_create_the_database_at_once_offline_and_nothing_else(tmp_
     assert list(in_a_process.home.iterdir()) == list(in_a_process.folder.iterdir()) == []
     connection = sqlite3.connect(base / "mlflow.db")
     assert connection.execute("select name, status from runs order by name").fetchall() == [
-        ("a", "FINISHED"),
-        ("b", "FINISHED"),
+        ("sac s7 a", "FINISHED"),
+        ("sac s7 b", "FINISHED"),
     ]
     connection.close()
 
@@ -193,10 +196,10 @@ def address():
     "kind", ["closed", "failing", pytest.param("silent", marks=pytest.mark.slow)]
 )
 def test_a_server_that_does_not_answer_costs_one_warning(tmp_path, address, kind, caplog):
-    from scilab_rl.tracking.mirror import Mirror
+    from scilab_rl.tracking.background import BackgroundTracker
     from scilab_rl.tracking.mlflow import MLflowTracker
 
-    mirror = Mirror(MLflowTracker(f"http://127.0.0.1:{address[kind]}"), "mlflow")
+    mirror = BackgroundTracker(MLflowTracker(f"http://127.0.0.1:{address[kind]}"), "mlflow")
     started = time.monotonic()
     mirror.begin(run_info(tmp_path))
     mirror.epoch(10, 1, {"x": 1.0})
@@ -205,3 +208,30 @@ def test_a_server_that_does_not_answer_costs_one_warning(tmp_path, address, kind
     assert time.monotonic() - started < 15.0
     switched_off = [r.getMessage() for r in caplog.records if "switched off" in r.getMessage()]
     assert len(switched_off) == 1
+
+
+def test_different_names_are_different_metrics(started):
+    tracker, run = started
+    long = "train/" + 300 * "x"
+    names = (
+        "train/α", "train/β", "train/_", "a b", "a_b", "A_b", "a//b", "a/b", "/a", "..",
+        f"{long}1", f"{long}2", "q[0]", "q[1]", "train/_x3b1_",
+    )  # fmt: skip
+    tracker.epoch(10, 1, {name: float(i) for i, name in enumerate(names)})
+    tracker.end(result())
+    metrics = stored(tracker).data.metrics
+    assert sorted(metrics.values()) == [float(i) for i in range(len(names))]
+    assert metrics["train/_x3b1_"] == 0.0 and metrics["a b"] == 3.0
+    assert tracker.remote_state(run, names, result()).steps == {name: {10} for name in names}
+
+
+def test_groups_and_tags_of_any_characters(database):
+    from scilab_rl.tracking.mlflow import MLflowTracker
+
+    parents = set()
+    for group in ("α", "β", "it's"):
+        tracker = MLflowTracker()
+        tracker.begin(run_info(database, f"of {ord(group[0])}", group=group, tags=(group,)))
+        parents.add(stored(tracker).data.tags["mlflow.parentRunId"])
+        tracker.end(result())
+    assert len(parents) == 3

@@ -41,14 +41,14 @@ class MLflow:
         return MlflowClient(f"sqlite:///{self.base / 'mlflow.db'}")
 
     def run(self, run):
-        runs = self.client().search_runs(["1"], f"run_name = '{run.name}'")
+        runs = self.client().search_runs(["1"], f"run_name LIKE '% {run.name}'")
         assert len(runs) == 1
         return runs[0]
 
     def points(self, run):
         run_id = self.run(run).info.run_id
         history = {
-            name: self.client().get_metric_history(run_id, name.replace("a[0]", "a_0_"))
+            name: self.client().get_metric_history(run_id, name.replace("a[0]", "a_x5b_0_x5d_"))
             for name in ALL
         }
         return {name: [(m.step, m.value) for m in points] for name, points in history.items()}
@@ -103,7 +103,7 @@ def place(request, base):
 @pytest.fixture
 def run(base, request):
     name = request.node.name.replace("[", "_").rstrip("]")
-    return run_info(base, name, parameters={"algorithm.gamma": 0.9, "odd[name]": 1}, group="g")
+    return run_info(base, name, arguments={"gamma": 0.9, "odd[name]": 1}, group="g")
 
 
 @pytest.fixture
@@ -156,9 +156,18 @@ def test_a_run_that_was_not_closed_is_closed(mlflow, run) -> None:
 
 def test_parameters_that_are_missing_are_sent_and_others_kept(mlflow, run) -> None:
     sync(mlflow.tracker(), run, EPOCHS, [], result())
-    more = dataclasses.replace(run, parameters={"algorithm.gamma": 0.5, "new": 1})
+    arguments = {"gamma": 0.5, "new": 1}
+    algorithm = dataclasses.replace(run.cfg.algorithm, arguments=arguments)
+    more = dataclasses.replace(run, cfg=dataclasses.replace(run.cfg, algorithm=algorithm))
     assert sync(mlflow.tracker(), more, EPOCHS, [], result()) == (0, 0)
-    assert mlflow.run(run).data.params == {"algorithm.gamma": "0.9", "odd_name_": "1", "new": "1"}
+    expected = {name: str(value) for name, value in run.cfg.flat().items()}
+    del expected["algorithm.odd[name]"]
+    assert mlflow.run(run).data.params == {
+        **expected,
+        "algorithm.gamma": "0.9",
+        "algorithm.odd_x5b_name_x5d_": "1",
+        "algorithm.new": "1",
+    }
     assert sync(mlflow.tracker(), more, EPOCHS, [], result()) is None
 
 

@@ -2,6 +2,7 @@
 
 import shutil
 import subprocess
+import types
 
 import pytest
 
@@ -15,7 +16,8 @@ ONE_RUN = """
     warnings.simplefilter("ignore")
     logging.basicConfig(stream=sys.stdout, format="%(levelname)s %(message)s", level=logging.INFO)
     from scilab_rl.results import RunResult
-    from scilab_rl.tracking.base import RunInfo
+    from scilab_rl.config.schema import AlgorithmConfig, RunConfig
+    from scilab_rl.tracking.base import TrackedRun
     from scilab_rl.tracking.wandb import WandbTracker
     base = Path(sys.argv[1])
     folder = base / "2026-01-02" / "run"
@@ -23,7 +25,9 @@ ONE_RUN = """
     film = folder / "videos" / "film.mp4"
     film.write_bytes(b"frames")
     tracker = WandbTracker()
-    tracker.begin(RunInfo(folder, base, "TinyReach-v0", "sac", 7, 20, 2, {"algorithm.gamma": 0.9}))
+    sac = AlgorithmConfig("sac", arguments={"gamma": 0.9})
+    cfg = RunConfig("TinyReach-v0", base_logdir=str(base), seed=7, n_epochs=2, algorithm=sac)
+    tracker.begin(TrackedRun(cfg, folder))
     tracker.epoch(10, 1, {"eval/mean_reward": -1.0})
     tracker.artifact(film)
     print("this belongs to the terminal")
@@ -87,3 +91,16 @@ def test_a_key_is_found_in_the_environment_or_in_netrc(tmp_path, monkeypatch):
     assert not has_key()
     monkeypatch.setenv("WANDB_API_KEY", "secret")
     assert has_key()
+
+
+def test_columns_of_its_own_are_not_overwritten():
+    from scilab_rl.tracking.wandb import WandbTracker
+
+    logged = {}
+    tracker = WandbTracker()
+    tracker._run = types.SimpleNamespace(log=lambda values, step: logged.update(values))
+    names = ("_step", "_timestamp", "_runtime", "_x5f_step", "train/α", "train/β", "a b", "_steps")
+    tracker.epoch(10, 1, dict.fromkeys(names, 1.0))
+    assert len(logged) == len(names)
+    assert not {"_step", "_timestamp", "_runtime"} & {*logged}
+    assert {"train/α", "train/β", "a b", "_steps"} <= {*logged}

@@ -17,7 +17,7 @@ import torch
 
 from scilab_rl import files
 from scilab_rl.errors import CheckpointError, ConfigError
-from scilab_rl.training import checkpoint, foreign
+from scilab_rl.training import checkpoint, sb3_archives
 from scilab_rl.training.snapshot import Snapshot, capture, restore
 
 
@@ -156,13 +156,13 @@ def test_another_schema_is_refused(saved):
 )
 def test_a_manifest_that_is_something_else_is_refused(saved, broken):
     (saved / "manifest.json").write_text(json.dumps(broken))
-    with pytest.raises(CheckpointError, match="no complete checkpoint"):
+    with pytest.raises(CheckpointError, match="not a complete checkpoint"):
         checkpoint.load(saved)
 
 
 def test_a_manifest_without_end_is_refused(saved):
     (saved / "manifest.json").write_text("[" * 100_000)
-    with pytest.raises(CheckpointError, match="no complete checkpoint"):
+    with pytest.raises(CheckpointError, match="not a complete checkpoint"):
         checkpoint.load(saved)
 
 
@@ -228,7 +228,7 @@ def test_a_foreign_zip_is_refused_with_the_way_to_allow_it(tmp_path):
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("data", "{}")
     with pytest.raises(ConfigError, match="--trust-pickle"):
-        foreign.load_archive(None, path)
+        sb3_archives.load_archive(None, path)
     with pytest.raises(ConfigError, match="no saved policy"):
         checkpoint.load(path)
 
@@ -242,7 +242,7 @@ WRITER = """
     import sys
     from pathlib import Path
     import numpy as np, torch
-    from scilab_rl.training import checkpoint, foreign
+    from scilab_rl.training import checkpoint, sb3_archives
     from scilab_rl.training.snapshot import capture
     for number in range(10_000):
         state = {"weights": torch.full((50_000,), float(number)), "step": number}

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from scilab_rl.envs.observed import StepBatch
+from scilab_rl.envs.vec_step import ObservedStep, decode_step
 from scilab_rl.metrics.logger import MetricLogger
 from scilab_rl.training.statistics import RolloutStatistics
 
 
-class Curious:
+class WithIntrinsicReward:
     """Rewards each step with where it led."""
 
     def intrinsic_rewards(self, observations, actions, next_observations):
@@ -19,15 +19,18 @@ def step(rewards, led_to, dones, terminal):
     infos = [{"terminal_observation": np.array([entry])} for entry in terminal]
     zeros = np.zeros(2, dtype=np.int64)
     observations = np.zeros((2, 1))
-    return StepBatch(
-        "train", 2, zeros, zeros, observations, np.zeros((2, 1)), np.array(rewards),
-        np.array(dones), infos, np.array(led_to)[:, None], [None, None], [None, None],
+    decoded = decode_step(
+        observations, np.zeros((2, 1)), np.array(led_to)[:, None], np.array(rewards),
+        np.array(dones), infos,
     )  # fmt: skip
+    nothing = [None, None]
+    return ObservedStep(**vars(decoded), phase="train", step=2, episodes=zeros,
+                        episode_steps=zeros, frames=nothing, states=nothing)  # fmt: skip
 
 
 def test_both_returns_are_logged_apart():
     logger, episodes = MetricLogger(), []
-    statistics = RolloutStatistics(logger, 2, episodes.append, curious=Curious())
+    statistics = RolloutStatistics(logger, 2, episodes.append, inspector=WithIntrinsicReward())
     statistics.on_step(step([-1.0, -1.0], [10.0, 20.0], [False, False], [0.0, 0.0]))
     assert logger.take()["train/intrinsic_reward_step"] == 10.0
     # The first environment's episode ends in 5; 99 is the first observation of the next one.

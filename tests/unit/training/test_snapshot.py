@@ -87,13 +87,13 @@ def test_optimizers_keep_the_parameters_they_change():
 
 
 def test_counters_and_loose_tensors_inside_modules_are_kept():
-    class Normaliser(torch.nn.Module):
+    class Normalizer(torch.nn.Module):
         def __init__(self, count):
             super().__init__()
             self.count = count
             self.offset = torch.full((2,), float(count))
 
-    one, other = torch.nn.Sequential(Normaliser(5)), torch.nn.Sequential(Normaliser(0))
+    one, other = torch.nn.Sequential(Normalizer(5)), torch.nn.Sequential(Normalizer(0))
     restore({"net": other}, transported(capture({"net": one})))
     assert other[0].count == 5
     assert other[0].offset.tolist() == [5.0, 5.0]

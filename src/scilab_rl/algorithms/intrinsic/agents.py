@@ -11,14 +11,13 @@ import torch.nn.functional as F
 from gymnasium import spaces
 from torch import Tensor
 
-from scilab_rl.algorithms.base import OneFileAlgorithm
-from scilab_rl.algorithms.observations import state_columns, to_vector
-
-Batch = Any  # observations as the algorithm's networks read them: a tensor or a dictionary of them
+from scilab_rl.envs.vec_step import Observation
+from scilab_rl.learning.base import OneFileAlgorithm
+from scilab_rl.learning.observations import Tensors, state_columns, to_vector
 
 
 class Agent(ABC):
-    """What an intrinsic reward may know of its algorithm.
+    """The part of an algorithm that an intrinsic reward may use.
 
     A *state* is an observation as a vector, without the desired goal, which is a wish of the agent
     and nothing that happens.
@@ -52,7 +51,7 @@ class Agent(ABC):
         """Kind of the actions."""
         return isinstance(self.algorithm.action_space, spaces.Discrete)
 
-    def states(self, observations: Batch) -> Tensor:
+    def states(self, observations: Tensors) -> Tensor:
         """Return the state of each observation. Shapes: ``(batch, n_states)``."""
         return self.vectors(observations)[:, self.state_columns]
 
@@ -62,7 +61,7 @@ class Agent(ABC):
             return F.one_hot(actions.long().flatten(), self.n_actions).float()
         return actions.float().clamp(-1.0, 1.0)  # what an environment does with actions beyond
 
-    def record(self, name: str, value: Any) -> None:
+    def record(self, name: str, value: Tensor) -> None:
         """Record a metric."""
         self.algorithm.logger.record(name, value)
 
@@ -72,15 +71,17 @@ class Agent(ABC):
         """Number of action-value networks; 0 where there are none."""
 
     @abstractmethod
-    def q_values(self, observations: Batch, actions: Tensor) -> Tensor:
+    def q_values(self, observations: Tensors, actions: Tensor) -> Tensor:
         """Return what each critic says. Shapes: ``(batch, n_critics)``."""
 
     @abstractmethod
-    def vectors(self, observations: Batch) -> Tensor:
+    def vectors(self, observations: Tensors) -> Tensor:
         """Return observations as vectors. Shapes: ``(batch, n_observations)``."""
 
     @abstractmethod
-    def as_sampled(self, observations: Any, env_actions: np.ndarray) -> tuple[Batch, Tensor]:
+    def as_sampled(
+        self, observations: Observation, env_actions: np.ndarray
+    ) -> tuple[Tensors, Tensor]:
         """Turn observations and actions of the environment into what the algorithm learns from."""
 
 
@@ -89,22 +90,25 @@ class OneFileAgent(Agent):
 
     @property
     def n_critics(self) -> int:
-        """Number of outputs of ``algorithm.critic``."""
-        if not hasattr(self.algorithm, "critic"):
+        """Number of columns of ``algorithm.action_values``."""
+        if not hasattr(self.algorithm, "action_values"):
             return 0
         observation = torch.zeros(1, self.algorithm.n_observations, device=self.device)
         action = torch.zeros(1, self.algorithm.n_actions, device=self.device)
         return int(self.q_values(observation, action).shape[-1])
 
-    def q_values(self, observations: Batch, actions: Tensor) -> Tensor:
-        """Ask ``algorithm.critic``."""
-        return self.algorithm.critic(observations, actions)
+    def q_values(self, observations: Tensors, actions: Tensor) -> Tensor:
+        """Ask ``algorithm.action_values``."""
+        return self.algorithm.action_values(observations, actions)
 
-    def vectors(self, observations: Batch) -> Tensor:
+    def vectors(self, observations: Tensors) -> Tensor:
         """Return the observations themselves."""
+        assert isinstance(observations, Tensor)
         return observations
 
-    def as_sampled(self, observations: Any, env_actions: np.ndarray) -> tuple[Batch, Tensor]:
+    def as_sampled(
+        self, observations: Observation, env_actions: np.ndarray
+    ) -> tuple[Tensors, Tensor]:
         """Use the algorithm's own conversions."""
         actions = torch.as_tensor(self.algorithm.from_env_actions(env_actions))
         return self.algorithm.to_vector(observations), actions.to(self.device)
@@ -118,7 +122,7 @@ class StableBaselinesAgent(Agent):
         """Number of critics of the policy; a network for discrete actions is none."""
         return getattr(getattr(self.algorithm.policy, "critic", None), "n_critics", 0)
 
-    def q_values(self, observations: Batch, actions: Tensor) -> Tensor:
+    def q_values(self, observations: Tensors, actions: Tensor) -> Tensor:
         """Ask the policy's critics; TQC's say the mean of their quantiles."""
         critic = self.algorithm.policy.critic
         was_training = critic.training
@@ -127,11 +131,13 @@ class StableBaselinesAgent(Agent):
         critic.set_training_mode(was_training)
         return torch.cat(answer, dim=1) if isinstance(answer, tuple) else answer.mean(dim=2)
 
-    def vectors(self, observations: Batch) -> Tensor:
+    def vectors(self, observations: Tensors) -> Tensor:
         """Join what the replay buffer keeps apart."""
         return to_vector(observations, self.algorithm.observation_space, self.device)
 
-    def as_sampled(self, observations: Any, env_actions: np.ndarray) -> tuple[Batch, Tensor]:
+    def as_sampled(
+        self, observations: Observation, env_actions: np.ndarray
+    ) -> tuple[Tensors, Tensor]:
         """Use the policy's own conversions: the replay buffer holds scaled actions."""
         policy = self.algorithm.policy
         actions = np.asarray(env_actions)
@@ -140,7 +146,7 @@ class StableBaselinesAgent(Agent):
         return policy.obs_to_tensor(observations)[0], torch.as_tensor(actions, device=self.device)
 
 
-def agent_of(algorithm: Any) -> Agent:
+def make_agent_view(algorithm: Any) -> Agent:
     """Return an algorithm's face for intrinsic rewards."""
     if isinstance(algorithm, OneFileAlgorithm):
         return OneFileAgent(algorithm)

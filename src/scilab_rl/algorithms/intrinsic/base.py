@@ -1,4 +1,4 @@
-"""What all intrinsic rewards share: how they are scaled, mixed with the task's reward, and learned.
+"""The base of intrinsic rewards: how they are scaled, mixed with the task's reward, and learned.
 
 In every batch that the algorithm learns from, the environment's reward r_e is replaced by
 
@@ -7,24 +7,29 @@ In every batch that the algorithm learns from, the environment's reward r_e is r
 with the scale by ``normalize``. Then the models behind r_i learn from the batch. Random numbers are
 drawn from a generator of its own, so that ``weight: 0`` changes nothing at all.
 
-Metrics: train/intrinsic_reward (scaled, mean over the batch), train/intrinsic_loss. The framework
-records train/intrinsic_reward_step at each step and rollout/intrinsic_ep_rew_mean.
+The framework records the reward of each step and its sum over episodes, see `INTRINSIC_METRICS`.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any
+from collections.abc import Sequence
+from typing import ClassVar, TypeVar
 
 import numpy as np
 import torch
+from stable_baselines3.common.type_aliases import DictReplayBufferSamples, ReplayBufferSamples
 from torch import Tensor
 
-from scilab_rl.algorithms.finite import check_finite
-from scilab_rl.algorithms.intrinsic.agents import Agent, Batch
+from scilab_rl.algorithms.intrinsic.agents import Agent
 from scilab_rl.algorithms.intrinsic.normalization import NORMALIZATIONS, RunningMoments
+from scilab_rl.envs.vec_step import Observation
 from scilab_rl.errors import ConfigError, did_you_mean
+from scilab_rl.learning.declared import MetricEntry
+from scilab_rl.learning.finite import check_finite
+from scilab_rl.learning.observations import Tensors
 
+B = TypeVar("B", ReplayBufferSamples, DictReplayBufferSamples)
 _LARGEST_STATE = 5.0  # standard deviations (Burda et al., 2018, section 2.4)
 
 
@@ -44,7 +49,13 @@ class IntrinsicReward(ABC):
     Attributes:
         optimizer: Of the learned models; None where nothing is learned.
         n_updates: Gradient steps so far.
+        metrics: What it records, see `scilab_rl.learning.declared`.
     """
+
+    metrics: ClassVar[Sequence[MetricEntry]] = (
+        "train/intrinsic_reward",  # scaled, mean over the batch
+        ("train/intrinsic_loss", "it learns models", lambda self: self.optimizer is not None),
+    )
 
     def __init__(
         self,
@@ -74,7 +85,7 @@ class IntrinsicReward(ABC):
         self.n_updates = 0
 
     @abstractmethod
-    def reward(self, observations: Batch, actions: Tensor, next_observations: Batch) -> Tensor:
+    def reward(self, observations: Tensors, actions: Tensor, next_observations: Tensors) -> Tensor:
         """Return r_i of a batch, unscaled and without a gradient; draws no random numbers.
 
         Shapes:
@@ -92,7 +103,7 @@ class IntrinsicReward(ABC):
         raise NotImplementedError
 
     def vectors(
-        self, observations: Batch, actions: Tensor, next_observations: Batch
+        self, observations: Tensors, actions: Tensor, next_observations: Tensors
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Return states, actions and next states as models read them.
 
@@ -104,9 +115,9 @@ class IntrinsicReward(ABC):
 
     def update(
         self,
-        observations: Batch,
+        observations: Tensors,
         actions: Tensor,
-        next_observations: Batch,
+        next_observations: Tensors,
         batch_size: int | None = None,
     ) -> None:
         """Learn from transitions.
@@ -138,9 +149,9 @@ class IntrinsicReward(ABC):
     def mix(
         self,
         rewards: Tensor,
-        observations: Batch,
+        observations: Tensors,
         actions: Tensor,
-        next_observations: Batch,
+        next_observations: Tensors,
         batch_size: int | None = None,
     ) -> Tensor:
         """Return r for a batch of r_e, then learn from the batch.
@@ -164,14 +175,14 @@ class IntrinsicReward(ABC):
         self.update(observations, actions, next_observations, batch_size)
         return (1 - self.weight) * rewards + self.weight * intrinsic.view_as(rewards)
 
-    def add_to(self, batch: Any) -> Any:
+    def apply(self, batch: B) -> B:
         """Return a sampled batch of a replay buffer with r in the place of r_e."""
         transitions = (batch.observations, batch.actions, batch.next_observations)
         return batch._replace(rewards=self.mix(batch.rewards, *transitions))
 
     @torch.no_grad()
-    def of_steps(
-        self, observations: Any, env_actions: np.ndarray, next_observations: Any
+    def evaluate(
+        self, observations: Observation, env_actions: np.ndarray, next_observations: Observation
     ) -> Tensor:
         """Return the scaled r_i of steps, as a vector environment gives them.
 

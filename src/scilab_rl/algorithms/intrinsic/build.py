@@ -2,28 +2,28 @@
 
 One-file algorithms have a parameter ``intrinsic`` and call `make_intrinsic_reward`. Off-policy
 algorithms of Stable-Baselines3 need not be changed: they learn from what their replay buffer
-samples, and `rewarding` makes a buffer of the same kind whose samples carry the mixed reward. It is
-computed at sampling, with the models of that moment, and so also for the goals that hindsight
-replay puts in.
+samples, and `with_intrinsic_reward` makes a buffer of the same kind whose samples carry the mixed
+reward. It is computed at sampling, with the models of that moment, and so also for the goals that
+hindsight replay puts in.
 """
 
 from __future__ import annotations
 
 import functools
 import importlib
-import inspect
 from collections.abc import Mapping
 from typing import Any
 
 import torch
 from stable_baselines3.common.buffers import ReplayBuffer
 
-from scilab_rl.algorithms.intrinsic.agents import agent_of
+from scilab_rl.algorithms.intrinsic.agents import make_agent_view
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
 from scilab_rl.errors import ConfigError, did_you_mean, listing
+from scilab_rl.learning.values import constructor_parameters
 from scilab_rl.seeding import derive_seed
 
-_HERE, _DESK = "scilab_rl.algorithms.intrinsic", "custom_algorithms"
+_HERE, _PROJECT = "scilab_rl.algorithms.intrinsic", "custom_algorithms"
 INTRINSIC_REWARDS = {
     "critic_variance": f"{_HERE}.critic_variance.CriticVariance",
     "disagreement": f"{_HERE}.disagreement.Disagreement",
@@ -34,7 +34,7 @@ INTRINSIC_REWARDS = {
 
 
 def make_intrinsic_reward(
-    chosen: str | Mapping[str, Any] | None, algorithm: Any
+    chosen: str | Mapping[str, object] | None, algorithm: Any
 ) -> IntrinsicReward | None:
     """Make the intrinsic reward that a configuration names.
 
@@ -57,17 +57,17 @@ def make_intrinsic_reward(
     # The weights are drawn on the CPU.
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
-        return cls(agent_of(algorithm), seed=seed, **settings)
+        return cls(make_agent_view(algorithm), seed=seed, **settings)
 
 
-def intrinsic_reward_class(name: Any) -> type[IntrinsicReward]:
-    """Return the class of a shipped reward, or of one on the desk (``custom_algorithms.x.Y``).
+def intrinsic_reward_class(name: object) -> type[IntrinsicReward]:
+    """Return the class of a shipped reward, or of a project's own (``custom_algorithms.x.Y``).
 
     Raises:
         ConfigError: If there is none.
     """
-    path = INTRINSIC_REWARDS.get(name, name)
-    if isinstance(path, str) and path.startswith((_HERE, f"{_DESK}.")):
+    path = INTRINSIC_REWARDS.get(str(name), name)
+    if isinstance(path, str) and path.startswith((_HERE, f"{_PROJECT}.")):
         module, _, cls_name = path.rpartition(".")
         try:
             cls = getattr(importlib.import_module(module), cls_name)
@@ -75,7 +75,7 @@ def intrinsic_reward_class(name: Any) -> type[IntrinsicReward]:
             raise ConfigError(f"algorithm.intrinsic: '{name}' cannot be found: {error}.") from error
         if isinstance(cls, type) and issubclass(cls, IntrinsicReward):
             return cls
-        raise ConfigError(f"algorithm.intrinsic: '{name}' is no subclass of IntrinsicReward.")
+        raise ConfigError(f"algorithm.intrinsic: '{name}' is not a subclass of IntrinsicReward.")
     raise ConfigError(
         f"algorithm.intrinsic must name an intrinsic reward, but it is {name!r}."
         f"{did_you_mean(str(name), INTRINSIC_REWARDS)} There are: {listing(INTRINSIC_REWARDS)}; "
@@ -85,17 +85,14 @@ def intrinsic_reward_class(name: Any) -> type[IntrinsicReward]:
 
 def allowed_settings(cls: type[IntrinsicReward]) -> list[str]:
     """Return the settings of a reward: its own first, then those that all have."""
-    signatures = [inspect.signature(cls), inspect.signature(IntrinsicReward)]
-    names = [
+    return [
         parameter.name
-        for signature in signatures
-        for parameter in signature.parameters.values()
+        for parameter in constructor_parameters(cls).values()
         if parameter.kind is parameter.KEYWORD_ONLY and parameter.name != "seed"
     ]
-    return list(dict.fromkeys(names))
 
 
-class _Rewarding:
+class _IntrinsicReward:
     """A replay buffer, mixed in before its class, whose samples carry the intrinsic reward."""
 
     intrinsic: IntrinsicReward | None = None
@@ -103,27 +100,27 @@ class _Rewarding:
     def sample(self, *args: Any, **kwargs: Any) -> Any:
         """Sample transitions and mix the intrinsic reward into theirs."""
         batch = super().sample(*args, **kwargs)  # type: ignore[misc]
-        return batch if self.intrinsic is None else self.intrinsic.add_to(batch)
+        return batch if self.intrinsic is None else self.intrinsic.apply(batch)
 
 
 @functools.cache
-def rewarding(buffer_class: type[ReplayBuffer]) -> type[ReplayBuffer]:
+def with_intrinsic_reward(buffer_class: type[ReplayBuffer]) -> type[ReplayBuffer]:
     """Return a kind of replay buffer whose samples carry the intrinsic reward."""
-    return type(f"Rewarding{buffer_class.__name__}", (_Rewarding, buffer_class), {})
+    return type(f"IntrinsicReward{buffer_class.__name__}", (_IntrinsicReward, buffer_class), {})
 
 
-def reward_intrinsically(algorithm: Any, chosen: str | Mapping[str, Any]) -> None:
+def attach_intrinsic_reward(algorithm: Any, chosen: str | Mapping[str, object]) -> None:
     """Let an off-policy algorithm of Stable-Baselines3 learn from an intrinsic reward too.
 
     Args:
-        algorithm: Built with a replay buffer that is `rewarding`.
+        algorithm: Built with a replay buffer of `with_intrinsic_reward`.
         chosen: As for `make_intrinsic_reward`.
     """
     algorithm.intrinsic = make_intrinsic_reward(chosen, algorithm)
     algorithm.replay_buffer.intrinsic = algorithm.intrinsic
 
 
-def _check_settings(name: str, cls: type[IntrinsicReward], settings: Mapping[str, Any]) -> None:
+def _check_settings(name: str, cls: type[IntrinsicReward], settings: Mapping[str, object]) -> None:
     allowed = allowed_settings(cls)
     for setting, value in settings.items():
         if setting not in allowed:

@@ -12,9 +12,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scilab_rl.algorithms.intrinsic.agents import Agent, Batch
+from scilab_rl.algorithms.intrinsic.agents import Agent
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
 from scilab_rl.errors import ConfigError
+from scilab_rl.learning.nn import critic_variance
+from scilab_rl.learning.observations import Tensors
 
 
 class CriticVariance(IntrinsicReward):
@@ -36,15 +38,6 @@ class CriticVariance(IntrinsicReward):
             )
 
     @torch.no_grad()
-    def reward(self, observations: Batch, actions: Tensor, next_observations: Batch) -> Tensor:
+    def reward(self, observations: Tensors, actions: Tensor, next_observations: Tensors) -> Tensor:
         """Return Var_i[Q_i(s, a)]."""
-        return variance_over_critics(self.agent.q_values(observations, actions))
-
-
-def variance_over_critics(q_values: Tensor) -> Tensor:
-    """Return the mean squared deviation from the mean.
-
-    Shapes:
-        q_values: ``(batch, n_critics)``; result: ``(batch,)``.
-    """
-    return q_values.var(dim=1, correction=0)
+        return critic_variance(self.agent.q_values(observations, actions)).squeeze(1)

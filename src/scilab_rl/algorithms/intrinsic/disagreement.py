@@ -17,9 +17,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scilab_rl.algorithms.intrinsic.agents import Agent, Batch
+from scilab_rl.algorithms.intrinsic.agents import Agent
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
-from scilab_rl.algorithms.intrinsic.networks import Ensemble
+from scilab_rl.learning.nn import Ensemble
+from scilab_rl.learning.observations import Tensors
 
 
 class Disagreement(IntrinsicReward):
@@ -48,14 +49,14 @@ class Disagreement(IntrinsicReward):
         self.optimizer = torch.optim.Adam(self.models.parameters(), learning_rate)
 
     @torch.no_grad()
-    def reward(self, observations: Batch, actions: Tensor, next_observations: Batch) -> Tensor:
+    def reward(self, observations: Tensors, actions: Tensor, next_observations: Tensors) -> Tensor:
         """Return the variance over the models (eq. 1)."""
         states, actions, _ = self.vectors(observations, actions, next_observations)
-        return ensemble_variance(self.models(torch.cat([states, actions], dim=1)))
+        return ensemble_variance(self.models(states, actions))
 
     def loss(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
         """Return the sum of the models' squared errors."""
-        predictions = self.models(torch.cat([states, actions], dim=1))
+        predictions = self.models(states, actions)
         return (predictions - next_states).square().sum(dim=2).mean(dim=1).sum()
 
 

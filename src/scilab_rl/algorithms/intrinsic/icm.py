@@ -23,9 +23,10 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from scilab_rl.algorithms.intrinsic.agents import Agent, Batch
+from scilab_rl.algorithms.intrinsic.agents import Agent
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
-from scilab_rl.algorithms.intrinsic.networks import network
+from scilab_rl.learning.nn import network
+from scilab_rl.learning.observations import Tensors
 
 
 class IntrinsicCuriosityModule(IntrinsicReward):
@@ -59,7 +60,7 @@ class IntrinsicCuriosityModule(IntrinsicReward):
         self.optimizer = torch.optim.Adam(networks.to(agent.device).parameters(), learning_rate)
 
     @torch.no_grad()
-    def reward(self, observations: Batch, actions: Tensor, next_observations: Batch) -> Tensor:
+    def reward(self, observations: Tensors, actions: Tensor, next_observations: Tensors) -> Tensor:
         """Return 1/2 || phi^(s') - phi(s') ||^2 (eq. 6)."""
         states, actions, next_states = self.vectors(observations, actions, next_observations)
         return self._forward_error(self.features(states), actions, self.features(next_states))

@@ -5,7 +5,7 @@ give normal distributions learn by maximum likelihood:
 
     r_i = KL(p(s'|s, a) || p(s'|a)),    loss = E[-log p(s'|s, a) - log p(s'|a)].
 
-The algorithm ``cleansacmc`` is the same idea written out in one file.
+The algorithm ``cleansacmc`` is the same idea, with the models of its own batches.
 """
 
 from __future__ import annotations
@@ -14,11 +14,12 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from scilab_rl.algorithms.cleansacmc import NextStateModel, gaussian_kl, gaussian_nll
-from scilab_rl.algorithms.intrinsic.agents import Agent, Batch
+from scilab_rl.algorithms.cleansacmc import NextStateModels
+from scilab_rl.algorithms.intrinsic.agents import Agent
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
+from scilab_rl.learning.observations import Tensors
 
 
 class MorphologicalComputation(IntrinsicReward):
@@ -40,22 +41,15 @@ class MorphologicalComputation(IntrinsicReward):
         **common: Any,
     ) -> None:
         super().__init__(agent, **common)
-        n_states, n_actions = agent.n_states, agent.n_actions
-        self.state_action_model = NextStateModel(n_states + n_actions, n_states, net_arch)
-        self.action_model = NextStateModel(n_actions, n_states, net_arch)
-        models = nn.ModuleList([self.state_action_model, self.action_model]).to(agent.device)
-        self.optimizer = torch.optim.Adam(models.parameters(), learning_rate)
+        self.models = NextStateModels(agent.n_states, agent.n_actions, net_arch).to(agent.device)
+        self.optimizer = torch.optim.Adam(self.models.parameters(), learning_rate)
 
     @torch.no_grad()
-    def reward(self, observations: Batch, actions: Tensor, next_observations: Batch) -> Tensor:
+    def reward(self, observations: Tensors, actions: Tensor, next_observations: Tensors) -> Tensor:
         """Return KL(p(s'|s, a) || p(s'|a))."""
         states, actions, _ = self.vectors(observations, actions, next_observations)
-        return gaussian_kl(*self._informed(states, actions), *self.action_model(actions)).squeeze(1)
+        return self.models.divergence(states, actions).squeeze(1)
 
     def loss(self, states: Tensor, actions: Tensor, next_states: Tensor) -> Tensor:
         """Return the negative log likelihood of both models."""
-        informed = gaussian_nll(next_states, *self._informed(states, actions))
-        return informed + gaussian_nll(next_states, *self.action_model(actions))
-
-    def _informed(self, states: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        return self.state_action_model(torch.cat([states, actions], dim=1))
+        return self.models.loss(states, actions, next_states)

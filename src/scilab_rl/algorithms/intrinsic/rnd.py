@@ -16,9 +16,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from scilab_rl.algorithms.intrinsic.agents import Agent, Batch
+from scilab_rl.algorithms.intrinsic.agents import Agent
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
-from scilab_rl.algorithms.intrinsic.networks import network
+from scilab_rl.learning.nn import network
+from scilab_rl.learning.observations import Tensors
 
 
 class RandomNetworkDistillation(IntrinsicReward):
@@ -48,7 +49,7 @@ class RandomNetworkDistillation(IntrinsicReward):
         self.optimizer = torch.optim.Adam(self.predictor.parameters(), learning_rate)
 
     @torch.no_grad()
-    def reward(self, observations: Batch, actions: Tensor, next_observations: Batch) -> Tensor:
+    def reward(self, observations: Tensors, actions: Tensor, next_observations: Tensors) -> Tensor:
         """Return || f^(s') - f(s') ||^2."""
         _, _, next_states = self.vectors(observations, actions, next_observations)
         return squared_distance(self.predictor(next_states), self.target(next_states))

@@ -1,4 +1,4 @@
-"""The packages that bring environments; what we change in their tasks is in the files beside this.
+"""The packages that contain environments; our changes to their tasks are in the other files here.
 
 Each of these files is imported when its package is used, and its ``register()`` called.
 """
@@ -15,18 +15,18 @@ class Suite:
 
     Attributes:
         package: The package that has to be there; also the suite's name.
-        brings: Its tasks, in a few words.
+        contents: Its tasks, in a few words.
         extra: The extra of Scilab-RL that installs it; empty for what is always there.
         modules: Beginnings of the modules that its environments are made from.
         begins: Beginnings of its ids, which are unknown before the package is imported; empty for
             a suite whose ids are always known.
-        pip_options: What pip has to be told when it is installed.
+        pip_options: Options of pip for its installation.
         conflicts: What it cannot be installed with, and what to do.
         note: What one has to know before one trains in it.
     """
 
     package: str
-    brings: str
+    contents: str
     extra: str = ""
     modules: tuple[str, ...] = ()
     begins: tuple[str, ...] = ()
@@ -41,7 +41,7 @@ class Suite:
 
     @property
     def install_line(self) -> str:
-        """What the user types to get it; empty for what is always there."""
+        """The command that installs it; empty if it is always installed."""
         return f'pip install {self.pip_options}"scilab-rl[{self.extra}]"' if self.extra else ""
 
 
@@ -106,7 +106,7 @@ SUITES = (
         extra="panda",
         modules=("panda_gym.", "scilab_rl.envs.suites.panda_gym"),
         begins=("Panda",),
-        note="each reset builds the world anew (60 ms), as PyBullet's episodes depend on earlier "
+        note="each reset rebuilds the world (60 ms), as PyBullet's episodes depend on earlier "
         "ones; PandaFlip cannot be made: its texture is missing in panda-gym 3.0.7",
     ),
     Suite(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import gymnasium as gym
 import numpy as np
 from highway_env.envs.common.observation import KinematicsGoalObservation
 from highway_env.envs.parking_env import ParkingEnv
+
+from scilab_rl.envs.types import Info
 
 
 class GoalObservation(KinematicsGoalObservation):
@@ -29,7 +31,7 @@ class GoalObservation(KinematicsGoalObservation):
 
 
 class Parking(ParkingEnv):
-    """highway-env's parking, whose reward and ending can be computed for relabelled goals too.
+    """highway-env's parking, whose reward and ending can be computed for relabeled goals too.
 
     The original adds the cost of a collision in `step` alone, and has no ``compute_terminated``.
     """
@@ -42,8 +44,12 @@ class Parking(ParkingEnv):
             self.observation_type = GoalObservation(self, **self.config["observation"])
 
     def compute_reward(
-        self, achieved_goal: Any, desired_goal: Any, info: Any, p: float = 0.5
-    ) -> Any:
+        self,
+        achieved_goal: np.ndarray,
+        desired_goal: np.ndarray,
+        info: Info | Sequence[Info],
+        p: float = 0.5,
+    ) -> np.ndarray:
         """Return the proximity to the goal, minus the cost of a crash that the info tells of.
 
         Shapes:
@@ -53,7 +59,9 @@ class Parking(ParkingEnv):
         cost = np.power(difference @ np.asarray(self.config["reward_weights"]), p)
         return self.config["collision_reward"] * _crashed(info) - cost
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def compute_terminated(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Info | Sequence[Info]
+    ) -> np.ndarray:
         """Return whether the car is parked or has crashed. Shapes: as `compute_reward`."""
         proximity = ParkingEnv.compute_reward(self, achieved_goal, desired_goal, {})
         return (proximity > -self.config["success_goal_reward"]) | (_crashed(info) > 0)
@@ -66,7 +74,7 @@ def register() -> None:
         gym.register("parking-limited-v0", entry_point=entry_point, max_episode_steps=100)
 
 
-def _crashed(info: Any) -> Any:
+def _crashed(info: Info | Sequence[Info]) -> float | np.ndarray:
     """Return 1 where the car has crashed. Shapes: ``()`` or ``(n,)``."""
     if isinstance(info, dict):
         return float(info.get("crashed", False))

@@ -1,7 +1,7 @@
 """Meta-World's 50 tasks for a Sawyer arm: the dense originals, and goal tasks for HER.
 
 ``MetaW-drawer-close-v3`` is the original reward with the goal observed. ``-sparse`` and ``-dense``
-before the version make a goal task of it, for the tasks in `GOAL_TASKS`. The goal is drawn anew at
+before the version make a goal task of it, for the tasks in `GOAL_TASKS`. The goal is drawn again at
 each reset, unlike in Meta-World's own benchmarks, where it belongs to the instance; in the tasks of
 `SAME_GOAL`, the place of the object is.
 """
@@ -18,11 +18,12 @@ from gymnasium import spaces
 from gymnasium.envs.mujoco.mujoco_rendering import MujocoRenderer
 from metaworld.env_dict import ALL_V3_ENVIRONMENTS
 
-from scilab_rl.envs.goal import cost_per_step, minus_distance
+from scilab_rl.envs.goal import goal_distance, negative_distance, sparse_cost
+from scilab_rl.envs.types import Info, ResetResult, StepResult
 
 _ALL = (0, 1, 2)
 _X, _Y, _Z = (0,), (1,), (2,)
-_REWARDS = {"sparse": cost_per_step, "dense": minus_distance}
+_REWARDS = {"sparse": sparse_cost, "dense": negative_distance}
 STEP_LIMIT = 500
 _CAMERA = {"distance": 1.7, "azimuth": -45.0, "elevation": -30.0, "lookat": (0.0, 0.6, 0.15)}
 
@@ -140,33 +141,33 @@ class MetaWorld(gym.Env):
         # Remembered for hidden goals, it would clip the observed goal to zero.
         self.inner.__dict__.pop("sawyer_observation_space", None)
         # Places beyond the declared bounds do occur at the reset.
-        self.observation_space: Any = spaces.Box(-np.inf, np.inf, (39,), np.float64)
+        self.observation_space: spaces.Space = spaces.Box(-np.inf, np.inf, (39,), np.float64)
         self.action_space = spaces.Box(-1.0, 1.0, (4,), np.float32)
 
     @property
-    def model(self) -> Any:
+    def model(self) -> mujoco.MjModel:
         """MuJoCo's model."""
         return self.inner.model
 
     @property
-    def data(self) -> Any:
+    def data(self) -> mujoco.MjData:
         """MuJoCo's state."""
         return self.inner.data
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin an episode with a new goal."""
         super().reset(seed=seed)
         self.inner.np_random = self.np_random  # one generator for all chance
         observation, _ = self.inner.reset()
         return observation, {"is_success": False}
 
-    def step(self, action: np.ndarray) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Act for one step."""
         observation, reward, _, _, info = self.inner.step(np.asarray(action, dtype=np.float32))
         success = bool(info["success"])
         return observation, float(reward), False, False, {**info, "is_success": success}
 
-    def render(self) -> Any:
+    def render(self) -> np.ndarray | None:
         """Return a frame."""
         return self.inner.render()
 
@@ -174,7 +175,7 @@ class MetaWorld(gym.Env):
         """Free the graphics memory."""
         self.inner.close()
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Pickle as a new environment with the same arguments."""
         return type(self), (self.task, self.render_mode)
 
@@ -199,7 +200,7 @@ class MetaWorldGoal(MetaWorld):
             observation=self.observation_space, achieved_goal=goal, desired_goal=goal
         )
 
-    def reset(self, *, seed: int | None = None, options: dict | None = None) -> Any:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin an episode with a new goal.
 
         Meta-World's first observation shows objects where they were in the episode before, which
@@ -211,7 +212,7 @@ class MetaWorldGoal(MetaWorld):
         observation = self._with_goals(np.hstack([now, now, self.inner._get_pos_goal()]))
         return observation, {"is_success": self._is_success(observation)}
 
-    def step(self, action: np.ndarray) -> Any:
+    def step(self, action: np.ndarray) -> StepResult:
         """Act for one step; the original reward is kept as ``info["own_reward"]``."""
         vector, own_reward, terminated, truncated, info = super().step(action)
         observation = self._with_goals(vector)
@@ -219,16 +220,20 @@ class MetaWorldGoal(MetaWorld):
         goals = observation["achieved_goal"], observation["desired_goal"]
         return observation, float(self.compute_reward(*goals, info)), terminated, truncated, info
 
-    def compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def compute_reward(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         """Return the reward. Shapes: goals ``(..., n_axes)``, result ``(...)``."""
-        distance = np.linalg.norm(np.asarray(achieved_goal) - np.asarray(desired_goal), axis=-1)
+        distance = goal_distance(achieved_goal, desired_goal)
         return _REWARDS[self.reward_type](distance, self.goal_task.threshold)
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def compute_terminated(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         """Return False: reaching the goal does not end the episode. Shapes: as the reward's."""
         return np.zeros(np.shape(achieved_goal)[:-1], dtype=bool)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Pickle as a new environment with the same arguments."""
         return type(self), (self.task, self.reward_type, self.render_mode)
 

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import gymnasium as gym
 from gymnasium.envs.registration import WrapperSpec
 from gymnasium.utils import RecordConstructorArgs
+
+from scilab_rl.envs.types import StepResult
 
 
 class Solved(gym.Wrapper, RecordConstructorArgs):
@@ -20,7 +20,7 @@ class Solved(gym.Wrapper, RecordConstructorArgs):
         RecordConstructorArgs.__init__(self)
         gym.Wrapper.__init__(self, env)
 
-    def step(self, action: Any) -> Any:
+    def step(self, action: object) -> StepResult:
         """Act for one step."""
         observation, reward, terminated, truncated, info = self.env.step(action)
         solved = bool(info.get("solved", False))

@@ -2,14 +2,13 @@
 
 PyBullet keeps more than poses and speeds from one episode to the next, and neither a reset nor its
 saved states take that back: the same seed gave another episode after another one (0.8 cm apart
-after 20 steps of pushing). Here each reset builds the world anew, in the same PyBullet. And
+after 20 steps of pushing). Here each reset rebuilds the world, in the same PyBullet. And
 panda-gym draws unseeded goals from the operating system; here they follow from the last seed.
 """
 
 from __future__ import annotations
 
 import functools
-from typing import Any
 from unittest import mock
 
 import gymnasium as gym
@@ -18,19 +17,21 @@ from gymnasium import spaces
 from panda_gym.envs import panda_tasks
 from panda_gym.envs.core import RobotTaskEnv
 
+from scilab_rl.envs.types import Info, ResetResult
+
 _GRAVITY = -9.81  # panda-gym's, in m/s^2
 
 
 class Repeatable(RobotTaskEnv):
     """The parts that all tasks share; it comes before the task in the order of classes."""
 
-    action_space: Any
-    observation_space: Any
-    _constructor_arguments: tuple[tuple[Any, ...], dict[str, Any]]
+    action_space: spaces.Box
+    observation_space: spaces.Dict
+    _constructor_arguments: tuple[tuple[object, ...], dict[str, object]]
     _is_new: bool
     _is_building: bool
 
-    def __new__(cls, *args: Any, **kwargs: Any) -> Repeatable:
+    def __new__(cls, *args: object, **kwargs: object) -> Repeatable:
         """Remember the arguments, which the world is built from."""
         self = super().__new__(cls)
         self._constructor_arguments = args, kwargs
@@ -38,7 +39,7 @@ class Repeatable(RobotTaskEnv):
         self.metadata = dict(cls.metadata)  # panda-gym writes into it
         return self
 
-    def __init__(self, *args: Any, **kwargs: Any) -> None:
+    def __init__(self, *args: object, **kwargs: object) -> None:
         self._is_building = True
         super().__init__(*args, **kwargs)
         self._is_building = False
@@ -51,7 +52,7 @@ class Repeatable(RobotTaskEnv):
             }
         )
 
-    def reset(self, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
+    def reset(self, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin an episode in a new world."""
         if self._is_building:
             return super().reset(seed=seed, options=options)
@@ -62,11 +63,15 @@ class Repeatable(RobotTaskEnv):
         self._is_new = False
         return super().reset(seed=seed, options=options)
 
-    def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def compute_terminated(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         """Return whether the goal is reached, which ends an episode. Shapes: ``(..., 3)``."""
         return self.task.is_success(np.asarray(achieved_goal), np.asarray(desired_goal))
 
-    def _compute_reward(self, achieved_goal: Any, desired_goal: Any, info: Any) -> Any:
+    def _compute_reward(
+        self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: object
+    ) -> np.ndarray:
         return self.task.compute_reward(achieved_goal, desired_goal, info)
 
     def _build_again(self) -> None:
@@ -81,7 +86,7 @@ class Repeatable(RobotTaskEnv):
             type(self).__init__(self, *args, **kwargs)
         self.action_space = action_space
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         """Pickle as a new environment with the same arguments."""
         args, kwargs = self._constructor_arguments
         return functools.partial(type(self), *args, **kwargs), ()

@@ -29,8 +29,8 @@ class MyTask(FetchTask):
         """Return what is compared with the goal."""
         return self.gripper_position()
 
-    def observe(self) -> np.ndarray:
-        """Return what the agent sees beside the goal."""
+    def get_observation(self) -> np.ndarray:
+        """Return the observation without the goals."""
         return np.concatenate([self.gripper_position(), self.gripper_velocity()])
 
     def goal_markers(self) -> dict[str, np.ndarray]:

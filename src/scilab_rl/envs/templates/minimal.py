@@ -12,8 +12,9 @@ class MyTask(GoalEnv):
 
     action_size = 2
     threshold = 0.1
+    drawn_range = (-1.0, 1.0)  # of the axes in pictures
 
-    def restart(self) -> None:
+    def reset_state(self) -> None:
         """Begin in the middle."""
         self.place = np.zeros(2)
 
@@ -21,7 +22,7 @@ class MyTask(GoalEnv):
         """Draw a place; take all chance from ``self.np_random``."""
         return self.np_random.uniform(-1.0, 1.0, 2)
 
-    def apply(self, action: np.ndarray) -> None:
+    def apply_action(self, action: np.ndarray) -> None:
         """Move by up to a tenth per axis."""
         self.place = np.clip(self.place + 0.1 * action, -1.0, 1.0)
 
@@ -29,6 +30,6 @@ class MyTask(GoalEnv):
         """Return what is compared with the goal."""
         return self.place
 
-    def observe(self) -> np.ndarray:
-        """Return what the agent sees beside the goal."""
+    def get_observation(self) -> np.ndarray:
+        """Return the observation without the goals."""
         return self.place

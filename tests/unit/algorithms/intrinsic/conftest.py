@@ -1,4 +1,4 @@
-"""Agents without an algorithm, for equations; and whole algorithms as the exam builds them."""
+"""Agents without an algorithm, for equations; and algorithms of the contract test."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def agent_with(action_space: spaces.Space, critic: Any = None) -> OneFileAgent:
         n_actions=1,
     )
     if critic is not None:
-        algorithm.critic = critic
+        algorithm.action_values = critic
     return OneFileAgent(algorithm)
 
 
 @pytest.fixture
-def exam() -> Callable[..., AlgorithmContract]:
-    """Return a function that prepares the exam of an algorithm with an intrinsic reward."""
+def contract() -> Callable[..., AlgorithmContract]:
+    """Return a function that makes the contract test of an algorithm with an intrinsic reward."""
 
     def prepare(algorithm: str, intrinsic: Any = None, **arguments: Any) -> AlgorithmContract:
         contract = AlgorithmContract()

@@ -4,10 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from scilab_rl.algorithms.arguments import check_arguments
-from scilab_rl.algorithms.inspection import Inspection, recorded_names
 from scilab_rl.algorithms.intrinsic.build import INTRINSIC_REWARDS, make_intrinsic_reward
 from scilab_rl.errors import ConfigError
+from scilab_rl.learning.arguments import check_arguments
+from scilab_rl.learning.declared import recorded_metrics
+from scilab_rl.learning.inspector import AgentInspector
 from scilab_rl.metrics.logger import as_number
 from scilab_rl.testing.algorithms import _generators
 
@@ -25,25 +26,25 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("algorithm", "name"), PAIRS)
-def test_weight_zero_equals_no_intrinsic_reward_bit_for_bit(exam, algorithm, name):
-    plain = exam(algorithm).trained()
-    weightless = exam(algorithm, small(name, weight=0.0)).trained()
+def test_weight_zero_equals_no_intrinsic_reward_bit_for_bit(contract, algorithm, name):
+    plain = contract(algorithm).trained()
+    weightless = contract(algorithm, small(name, weight=0.0)).trained()
     assert differences_of_the_learner(plain, weightless) == []
     assert "train/intrinsic_reward" in weightless.logger.name_to_value
 
 
 @pytest.mark.parametrize(("algorithm", "name"), PAIRS)
-def test_interrupted_and_resumed_equals_uninterrupted(exam, algorithm, name, tmp_path):
-    contract = exam(algorithm, small(name, weight=0.5))
+def test_interrupted_and_resumed_equals_uninterrupted(contract, algorithm, name, tmp_path):
+    contract = contract(algorithm, small(name, weight=0.5))
     contract.test_continues_as_if_it_had_not_been_interrupted(tmp_path)
 
 
-def test_resume_restores_models_optimizers_and_statistics(exam, tmp_path):
+def test_resume_restores_models_optimizers_and_statistics(contract, tmp_path):
     """What the contract compares includes the intrinsic reward's own state."""
     from scilab_rl.training.snapshot import capture, restore
 
-    model = exam("cleansac", small("rnd")).trained()
-    fresh = exam("cleansac", small("rnd")).build(seed=8)
+    model = contract("cleansac", small("rnd")).trained()
+    fresh = contract("cleansac", small("rnd")).build(seed=8)
     restore({"algorithm": fresh}, capture({"algorithm": model}))
     one, other = model.intrinsic, fresh.intrinsic
     for name in ("target", "predictor"):
@@ -59,16 +60,16 @@ def test_resume_restores_models_optimizers_and_statistics(exam, tmp_path):
 
 
 @pytest.mark.parametrize("algorithm", ["cleansac", "cleanppo", "sac"])
-def test_weight_changes_what_is_learned(exam, algorithm):
-    weightless = exam(algorithm, small("rnd", weight=0.0)).trained()
-    curious = exam(algorithm, small("rnd", weight=1.0)).trained()
+def test_weight_changes_what_is_learned(contract, algorithm):
+    weightless = contract(algorithm, small("rnd", weight=0.0)).trained()
+    curious = contract(algorithm, small("rnd", weight=1.0)).trained()
     assert differences_of_the_learner(weightless, curious) != []
 
 
-def test_hindsight_samples_carry_the_mixed_reward(exam):
-    model = exam("sac", small("rnd", weight=0.5, normalize="none")).trained()
+def test_hindsight_samples_carry_the_mixed_reward(contract):
+    model = contract("sac", small("rnd", weight=0.5, normalize="none")).trained()
     buffer, intrinsic = model.replay_buffer, model.intrinsic
-    assert type(buffer).__name__ == "RewardingHindsightReplayBuffer"
+    assert buffer.intrinsic is intrinsic
     state = buffer.random.bit_generator.state
     with torch.no_grad():
         buffer.intrinsic = None
@@ -82,8 +83,8 @@ def test_hindsight_samples_carry_the_mixed_reward(exam):
     assert torch.equal(mixed.observations["desired_goal"], plain.observations["desired_goal"])
 
 
-def test_desired_goal_is_no_part_of_the_state(exam):
-    intrinsic = exam("sac", small("rnd", normalize_states=False)).build().intrinsic
+def test_desired_goal_is_no_part_of_the_state(contract):
+    intrinsic = contract("sac", small("rnd", normalize_states=False)).build().intrinsic
     space = intrinsic.agent.algorithm.observation_space
     before = {key: torch.as_tensor(entry.sample()[None]) for key, entry in space.spaces.items()}
     moved_goal = {**before, "desired_goal": before["desired_goal"] + 1.0}
@@ -97,14 +98,14 @@ def test_desired_goal_is_no_part_of_the_state(exam):
 
 
 @pytest.mark.parametrize("algorithm", ["cleansac", "cleanppo", "sac", "dqn"])
-def test_reward_of_steps_is_what_is_learned_from_them(exam, algorithm):
+def test_reward_of_steps_is_what_is_learned_from_them(contract, algorithm):
     """Observations and actions of the environment and of the algorithm mean the same."""
-    model = exam(algorithm, small("disagreement")).build(n_envs=3)
+    model = contract(algorithm, small("disagreement")).build(n_envs=3)
     env = model.get_env()
     before = env.reset()
     actions = np.array([env.action_space.sample() for _ in range(3)])
     after, _, _, _ = env.step(actions)
-    rewards = Inspection(model).intrinsic_rewards(before, actions, after)
+    rewards = AgentInspector(model).intrinsic_rewards(before, actions, after)
     assert rewards.shape == (3,)
     intrinsic, space = model.intrinsic, env.observation_space
     keys = [key for key in space.spaces if key != "desired_goal"]
@@ -122,32 +123,37 @@ def test_reward_of_steps_is_what_is_learned_from_them(exam, algorithm):
     torch.testing.assert_close(torch.as_tensor(rewards), expected)
 
 
-def test_construction_and_questions_draw_no_global_random_numbers(exam):
-    model = exam("sac").build()
+def test_construction_and_questions_draw_no_global_random_numbers(contract):
+    model = contract("sac").build()
     before = _generators()
     intrinsic = make_intrinsic_reward("icm", model)
     observations = model.get_env().reset()
-    intrinsic.of_steps(observations, np.zeros((1, 2), np.float32), observations)
+    intrinsic.evaluate(observations, np.zeros((1, 2), np.float32), observations)
     assert _generators() == before
 
 
-def test_seed_decides_the_weights_of_the_models(exam):
+def test_seed_decides_the_weights_of_the_models(contract):
     weights = [
-        exam("sac", small("rnd")).build(seed=seed).intrinsic.target[0].weight for seed in (7, 7, 8)
+        contract("sac", small("rnd")).build(seed=seed).intrinsic.target[0].weight
+        for seed in (7, 7, 8)
     ]
     assert torch.equal(weights[0], weights[1])
     assert not torch.equal(weights[0], weights[2])
 
 
-def test_only_curious_algorithms_answer_for_an_intrinsic_reward(exam):
-    assert "intrinsic_reward" not in Inspection(exam("sac").build()).quantities
-    curious = exam("sac", small("rnd")).build()
-    assert "intrinsic_reward" in Inspection(curious).quantities
-    assert {"train/intrinsic_reward_step", "train/intrinsic_loss"} <= recorded_names(curious)
-    assert "train/intrinsic_reward_step" not in recorded_names(exam("sac").build())
+def test_only_curious_algorithms_answer_for_an_intrinsic_reward(contract):
+    assert "intrinsic_reward" not in AgentInspector(contract("sac").build()).quantities
+    curious = contract("sac", small("rnd")).build()
+    assert "intrinsic_reward" in AgentInspector(curious).quantities
+    assert {"train/intrinsic_reward_step", "train/intrinsic_loss"} <= recorded_metrics(
+        curious
+    ).names
+    plain = recorded_metrics(contract("sac").build())
+    assert "train/intrinsic_reward_step" not in plain.names
+    assert "algorithm.intrinsic" in plain.absent["train/intrinsic_reward_step"]
 
 
-def test_a_reward_of_ones_own(exam, monkeypatch):
+def test_a_reward_of_ones_own(contract, monkeypatch):
     from types import ModuleType
 
     from .test_mixing import FirstEntry
@@ -155,11 +161,11 @@ def test_a_reward_of_ones_own(exam, monkeypatch):
     module = ModuleType("custom_algorithms.my_curiosity")
     module.FirstEntry, module.NotOne = FirstEntry, dict
     monkeypatch.setitem(__import__("sys").modules, "custom_algorithms.my_curiosity", module)
-    model = exam("cleansac", "custom_algorithms.my_curiosity.FirstEntry").trained()
+    model = contract("cleansac", "custom_algorithms.my_curiosity.FirstEntry").trained()
     assert isinstance(model.intrinsic, FirstEntry)
     assert as_number(model.logger.name_to_value["train/intrinsic_reward"]) != 0.0
-    with pytest.raises(ConfigError, match="no subclass of IntrinsicReward"):
-        exam("cleansac", "custom_algorithms.my_curiosity.NotOne").build()
+    with pytest.raises(ConfigError, match="not a subclass of IntrinsicReward"):
+        contract("cleansac", "custom_algorithms.my_curiosity.NotOne").build()
 
 
 REFUSALS = [
@@ -178,14 +184,14 @@ REFUSALS = [
 
 
 @pytest.mark.parametrize(("algorithm", "intrinsic", "message"), REFUSALS)
-def test_what_cannot_be_is_refused(exam, algorithm, intrinsic, message):
+def test_what_cannot_be_is_refused(contract, algorithm, intrinsic, message):
     with pytest.raises(ConfigError, match=message):
-        exam(algorithm, intrinsic).build()
+        contract(algorithm, intrinsic).build()
 
 
-def test_returns_over_several_steps_have_no_intrinsic_reward(exam):
+def test_returns_over_several_steps_have_no_intrinsic_reward(contract):
     with pytest.raises(ConfigError, match=r"n_steps=1"):
-        exam("sac", "rnd", n_steps=3, replay_buffer_class=None).build()
+        contract("sac", "rnd", n_steps=3, replay_buffer_class=None).build()
 
 
 def test_on_policy_algorithms_of_stable_baselines3_have_no_such_parameter():

@@ -89,9 +89,9 @@ def test_morphological_computation_is_the_divergence_of_two_normals(agent):
     intrinsic = MorphologicalComputation(agent, net_arch=[], **PLAIN)
     # p(s'|s, a) = N(s, 1), p(s'|a) = N((2 a, 0), 4), in two dimensions.
     identity = [[1, 0, 0], [0, 1, 0], [0, 0, 0], [0, 0, 0]]
-    set_linear(intrinsic.state_action_model.net[0], identity, [0, 0, 0, 0])
+    set_linear(intrinsic.models.state_action.net[0], identity, [0, 0, 0, 0])
     log_2 = math.log(2.0)
-    set_linear(intrinsic.action_model.net[0], [[2], [0], [0], [0]], [0, 0, log_2, log_2])
+    set_linear(intrinsic.models.action.net[0], [[2], [0], [0], [0]], [0, 0, log_2, log_2])
     # KL per dimension: log 2 + (1 + d^2) / 8 - 1/2 with d = (0, 2) and (2, -1).
     expected = [2 * log_2 + (2 + 4) / 8 - 1, 2 * log_2 + (2 + 5) / 8 - 1]
     torch.testing.assert_close(intrinsic.reward(STATES, ACTIONS, NEXT_STATES), tensor(expected))

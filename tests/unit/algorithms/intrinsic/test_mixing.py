@@ -109,7 +109,7 @@ def test_samples_of_a_replay_buffer_keep_all_but_the_reward(agent):
     batch = namedtuple("Batch", "observations actions next_observations dones rewards")
     states, actions, _ = transitions(2.0, 4.0)
     sampled = batch(states, actions, states, tensor([[0.0], [1.0]]), tensor([[-1.0], [-1.0]]))
-    added = FirstEntry(agent, weight=0.5, **PLAIN).add_to(sampled)
+    added = FirstEntry(agent, weight=0.5, **PLAIN).apply(sampled)
     assert added.rewards.tolist() == [[0.5], [1.5]]
     assert added.dones is sampled.dones and added.observations is sampled.observations
 

@@ -4,7 +4,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from scilab_rl.envs.examination import course, equal
+from scilab_rl.envs.checker import course, equal
 from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.testing.goal_environments import EnvironmentContract
 

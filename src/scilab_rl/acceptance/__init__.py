@@ -1,0 +1,1 @@
+"""Performance tests: acceptance rules with declared error rates, and baselines."""

@@ -1,0 +1,1 @@
+"""Comparing runs: groups, statistics of few seeds, tables and reports."""

@@ -1,0 +1,104 @@
+"""``scilab-rl export RUN --trials``: a tidy table for statistics and cognitive models."""
+
+from __future__ import annotations
+
+import argparse
+import logging
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from scilab_rl import files
+from scilab_rl.cli.parser import CommandParser, positive
+from scilab_rl.config.recorded import load_recorded
+from scilab_rl.config.schema import RunConfig
+from scilab_rl.config.workspace import open_project
+from scilab_rl.errors import ConfigError
+from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run
+
+_log = logging.getLogger(__name__)
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command and return its exit code."""
+    options = _parse(arguments)
+    open_project()
+    from scilab_rl.analysis.report import write_table
+
+    run = find_run(options.run, options.base_logdir)
+    cfg = load_recorded(run / CONFIG_FILE)
+    rows = _training_episodes(run) if options.training else _trials(run, cfg, options)
+    origin = {
+        "run": run.path.name,
+        "env": cfg.env,
+        "algorithm": cfg.algorithm.name,
+        "run_seed": cfg.seed,
+    }
+    kind = "training" if options.training else f"trials_{options.per}"
+    path = options.output or run / f"{kind}.{options.format}"
+    if path.suffix not in (".csv", ".parquet"):
+        raise ConfigError(f"--output must end in .csv or .parquet, but it is '{path}'.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_table([{**origin, **row} for row in rows], path)
+    _log.info("%d rows: %s", len(rows), path)
+    return 0
+
+
+def _trials(
+    run: RunDirectory, cfg: RunConfig, options: argparse.Namespace
+) -> Sequence[Mapping[str, object]]:
+    from scilab_rl.run.player import load_player
+    from scilab_rl.training.trajectory_table import by_episode, collect, softmax_choice
+
+    policy = find_policy(run, options.run, options.policy, "best", "finished")
+    env, model = load_player(cfg, policy, record=False)
+    seed = options.seed or int(cfg.seed) + 1
+    choose = None
+    if options.softmax is not None:
+        choose = softmax_choice(model, options.softmax, seed)
+    rows = collect(
+        model, env, options.episodes, seed, choose=choose, most_dimensions=options.dimensions
+    )
+    env.close()
+    chosen = by_episode(rows) if options.per == "episode" else rows
+    return [dict(row) for row in chosen]
+
+
+def _training_episodes(run: RunDirectory) -> Sequence[Mapping[str, object]]:
+    """Return the training episodes, as the run has recorded them."""
+    from scilab_rl.training.trajectory_table import fill_silent_outcomes
+
+    rows = files.read_json_lines(run / "metrics.jsonl")
+    rows = [row for row in rows if row.pop("kind", None) == "episode"]
+    if not rows:
+        raise ConfigError(f"The run '{run}' has no training episode yet.")
+    fill_silent_outcomes(rows)
+    return rows
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = CommandParser(
+        "export",
+        "Write the observations, actions and metrics of an agent as a tidy table.",
+        run=True,
+        base=True,
+    )
+    add = parser.add_argument
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument(
+        "--trials", action="store_true", help="new episodes of its policy (the default)"
+    )
+    what.add_argument("--training", action="store_true", help="the recorded training episodes")
+    add("--per", choices=("step", "episode"), default="step", help="what a row is; default: a step")
+    add("--episodes", type=positive, default=20, help="default: 20")
+    add("--policy", choices=("best", "finished"), default="finished")
+    add(
+        "--softmax",
+        type=float,
+        metavar="BETA",
+        help="choose with probability proportional to exp(BETA Q), as a simulated participant",
+    )
+    add("--dimensions", type=positive, default=12, help="most numbers of an observation's parts")
+    add("--seed", type=int, default=0, help="default: the run's seed plus 1")
+    add("--format", choices=("csv", "parquet"), default="csv")
+    add("--output", type=Path, metavar="FILE", help="default: inside the run's folder")
+    return parser.parse_args(arguments)

@@ -1,0 +1,63 @@
+"""The project folder: where a researcher keeps her own YAML, algorithms and environments."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+import sys
+from pathlib import Path
+
+from scilab_rl.errors import ConfigError
+
+SHIPPED_CONF = Path(__file__).parents[1] / "conf"
+PROJECT_CONF = Path("conf")
+PROJECT_ALGORITHMS = Path("src/custom_algorithms")
+PROJECT_ENVS = "custom_envs"
+
+
+def open_project() -> None:
+    """Make the project in the current folder importable and let it register its environments.
+
+    Raises:
+        ConfigError: If a project file hides behind a shipped one, or ``custom_envs`` is
+            broken.
+    """
+    source = str(Path("src").resolve())
+    if Path(source).is_dir() and source not in sys.path:
+        sys.path.insert(0, source)
+    refuse_duplicates()
+    if importlib.util.find_spec(PROJECT_ENVS) is not None:
+        try:
+            importlib.import_module(PROJECT_ENVS)
+        except Exception as error:
+            raise ConfigError(
+                f"src/custom_envs cannot be imported: {type(error).__name__}: {error}"
+            ) from error
+
+
+def refuse_duplicates() -> None:
+    """Reject a project file with the name of a shipped one, which Hydra would silently ignore.
+
+    Raises:
+        ConfigError: With the name of the file.
+    """
+    for path in sorted(PROJECT_CONF.rglob("*.yaml")):
+        name = path.relative_to(PROJECT_CONF)
+        if (SHIPPED_CONF / name).is_file():
+            raise ConfigError(
+                f"'{path}' has the name of a file that Scilab-RL ships, so it would be ignored. "
+                f"Rename it, for example to '{path.with_stem('my_' + path.stem)}'."
+            )
+
+
+def config_files(group: str) -> dict[str, Path]:
+    """Return the option names of a configuration group and their files, shipped and project folder.
+
+    Args:
+        group: For example ``algorithm`` or ``performance``; sub-folders become ``folder/name``.
+    """
+    options = {}
+    for root in (SHIPPED_CONF / group, PROJECT_CONF / group):
+        for path in sorted(root.rglob("*.yaml")):
+            options[path.relative_to(root).with_suffix("").as_posix()] = path
+    return options

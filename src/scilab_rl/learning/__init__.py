@@ -1,0 +1,1 @@
+"""The parts of algorithms: base class, replay buffers, networks, inspection, checks."""

@@ -1,0 +1,1 @@
+"""Training many runs: worker processes of this machine, or jobs of Ray and SLURM."""

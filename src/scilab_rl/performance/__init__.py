@@ -1,1 +1,0 @@
-"""Tests that guard learning: gates with declared error rates, baselines, and comparisons."""

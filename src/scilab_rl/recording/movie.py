@@ -1,0 +1,328 @@
+"""The paper's figure as a video: the scene on the left, the curves up to now on the right.
+
+All that does not move is drawn once per clip and then uncovered step by step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scilab_rl.drawing import BACKGROUND, COLORS, FAINT, FRAME, GRID, INK, font, number_text, ticks
+from scilab_rl.recording.records import (
+    Clip,
+    Record,
+    decode_picture,
+    picture_size,
+    title_of,
+    value_range,
+)
+
+if TYPE_CHECKING:
+    from PIL.Image import Image
+    from PIL.ImageDraw import ImageDraw
+
+SCENE_BOX = (640, 480)  # pixels; the scene keeps its shape inside
+COLUMN = 320  # pixels of a column of panels
+HEADER = 32
+_SMALL = 200
+_EVEN = 2  # H.264 needs even sides
+_ROWS = 4  # panels in one column, until there are four columns
+_MIN_PANEL_HEIGHT = 112
+NO_VALUE = "-"  # the font has no dash
+_SMOOTH = 2  # everything that does not move is drawn twice as large and scaled down
+_TITLE, _LEFT, _RIGHT, _BOTTOM = 22, 50, 12, 18  # pixels around the curves
+
+
+def write_movie(clip: Clip, path: Path) -> None:
+    """Write a clip as mp4, which stays playable when the program is killed.
+
+    Raises:
+        OSError: If not all frames are in the file, for example because the disk is full.
+    """
+    import imageio_ffmpeg
+
+    frames = MovieFrames(clip)
+    encoder = imageio_ffmpeg.write_frames(
+        str(path),
+        frames.size,
+        fps=clip.info.fps,
+        macro_block_size=_EVEN,
+        output_params=["-movflags", "+frag_keyframe+empty_moov", "-crf", "23"],
+    )
+    encoder.send(None)
+    try:
+        for index in range(len(frames)):
+            encoder.send(frames[index])
+    except OSError as error:  # it holds the whole command, and what ffmpeg has said at its end
+        said = str(error).partition("STDERR OUTPUT:")[2].strip().rpartition("\n")[2]
+        reason = f": {said}" if said else ""
+        raise OSError(f"ffmpeg ended before the video did{reason}") from error
+    finally:
+        encoder.close()
+    try:
+        n_written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the encoder hides failures
+    except RuntimeError:  # it cannot even be opened; the message is all that ffmpeg has to say
+        n_written = 0
+    if n_written != len(frames):
+        raise OSError(f"{n_written} of {len(frames)} frames could be written; is the disk full?")
+
+
+class MovieFrames:
+    """The frames of a video, one per scene.
+
+    Args:
+        clip: The finished clip.
+    """
+
+    def __init__(self, clip: Clip) -> None:
+        self.clip = clip
+        sizes = [picture_size(record.picture) for record in clip.records if record.picture]
+        # One scale for the whole clip, so that a frame that grows is seen to grow.
+        width, height = np.max(sizes, axis=0) if sizes else (0, 0)
+        self.scale = min(SCENE_BOX[0] / width, SCENE_BOX[1] / height) if sizes else 1.0
+        self.scene_size = self._scaled(width, height) if sizes else (0, 0)
+        n_panels = len(clip.info.panels)
+        content = sheet_height(n_panels, SCENE_BOX[1]) if n_panels else SCENE_BOX[1]
+        if not n_panels and not sizes:
+            self.scene_size = SCENE_BOX  # nothing but the numbers above it
+        column = COLUMN if sizes else SCENE_BOX[0]
+        self.sheet = PanelSheet(clip, column, content) if n_panels else None
+        sheet_width = self.sheet.size[0] if self.sheet else 0
+        width, height = self.scene_size[0] + sheet_width, HEADER + content
+        self.size = width + width % _EVEN, height + height % _EVEN
+        self.scene_corner = (0, HEADER + (content - self.scene_size[1]) // 2)
+
+    def __len__(self) -> int:
+        return len(self.clip.records)
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        """Return the frame of a scene. Shapes: ``(height, width, 3)``, uint8."""
+        from PIL import Image, ImageDraw
+
+        record = self.clip.records[index]
+        image = Image.new("RGB", self.size, BACKGROUND)
+        if record.picture:
+            scene = self._scene(record)
+            left, top = ((self.scene_size[i] - scene.size[i]) // 2 for i in (0, 1))
+            image.paste(scene, (self.scene_corner[0] + left, self.scene_corner[1] + top))
+        if self.sheet is not None:
+            image.paste(self.sheet.until(index), (self.scene_size[0], HEADER))
+        self._write_header(ImageDraw.Draw(image), record)
+        return np.asarray(image)
+
+    def _scene(self, record: Record) -> Image:
+        from PIL import Image
+
+        scene = Image.fromarray(decode_picture(record.picture))
+        is_small = max(scene.size) <= _SMALL
+        how = Image.Resampling.NEAREST if is_small else Image.Resampling.LANCZOS
+        size = self._scaled(*scene.size)
+        return scene if scene.size == size else scene.resize(size, how)
+
+    def _scaled(self, width: int, height: int) -> tuple[int, int]:
+        return max(1, round(width * self.scale)), max(1, round(height * self.scale))
+
+    def _write_header(self, draw: ImageDraw, record: Record) -> None:
+        info, letters = self.clip.info, font(14)
+        draw.text((12, 9), f"{info.env_id}  {info.algorithm}", fill=INK, font=letters)
+        used = 12 + draw.textlength(f"{info.env_id}  {info.algorithm}", font=letters)
+        where = f"{info.place(record.episode)}, step {record.step}"
+        draw.text((used + 16, 9), where, fill=FAINT, font=letters)
+        events = ", ".join(event for event in record.events if event != "episode start")
+        if events and self.size[0] > self.scene_size[0]:
+            draw.text((self.size[0] - 12, 9), events, fill="#dc2626", font=letters, anchor="ra")
+
+
+def grid(n_panels: int) -> tuple[int, int]:
+    """Return rows and columns for a number of panels; none is left out.
+
+    >>> [grid(n) for n in (1, 3, 4, 5, 7, 9, 11, 16, 20)]
+    [(1, 1), (3, 1), (4, 1), (3, 2), (4, 2), (3, 3), (4, 3), (4, 4), (5, 4)]
+    """
+    columns = min(math.ceil(n_panels / _ROWS), _ROWS)
+    return math.ceil(n_panels / columns), columns
+
+
+def sheet_height(n_panels: int, at_least: int) -> int:
+    """Return the height in pixels that the panels need."""
+    return max(at_least, grid(n_panels)[0] * _MIN_PANEL_HEIGHT)
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """Where a panel lies and what it shows; pixels on the finished sheet."""
+
+    name: str
+    curves: dict[str, list[float | None]]
+    left: int
+    top: int
+    right: int
+    bottom: int
+    low: float
+    high: float
+
+    def y(self, number: float) -> float:
+        """Return the height of a number on the sheet."""
+        share = (number - self.low) / (self.high - self.low)
+        return self.bottom - share * (self.bottom - self.top)
+
+
+class PanelSheet:
+    """The panels of a clip, drawn up to any of its scenes.
+
+    Ranges are those of the whole clip, so that nothing jumps.
+
+    Args:
+        clip: The finished clip.
+        width: Pixels of one column.
+        height: Pixels of the sheet.
+    """
+
+    def __init__(self, clip: Clip, width: int, height: int) -> None:
+        names = clip.info.panels
+        rows, columns = grid(len(names))
+        self.size = (columns * width, height)
+        self.n = len(clip.records)
+        self.breaks = {i for i in range(1, self.n) if clip.records[i].step == 0}
+        self.panels = [
+            self._place(clip, name, index, rows, width) for index, name in enumerate(names)
+        ]
+        self._empty = self._drawn(with_curves=False)
+        self._full = self._drawn(with_curves=True)
+
+    def until(self, index: int) -> Image:
+        """Return the sheet as a Pillow image, with curves up to this scene."""
+        from PIL import Image, ImageDraw
+
+        pixels = self._empty.copy()
+        for panel in self.panels:
+            x = round(self._x(panel, index)) + 1
+            area = np.s_[panel.top - 4 : panel.bottom + 4, panel.left - 3 : x]
+            pixels[area] = self._full[area]
+        image = Image.fromarray(pixels)
+        draw = ImageDraw.Draw(image)
+        for panel in self.panels:
+            self._draw_cursor(draw, panel, index)
+        return image
+
+    def _place(self, clip: Clip, name: str, index: int, rows: int, width: int) -> _Panel:
+        column, row = divmod(index, rows)
+        height = self.size[1] / rows
+        curves = clip.curves(name)
+        low, high = value_range(list(curves.values()))
+        return _Panel(
+            name,
+            curves,
+            left=column * width + _LEFT,
+            top=round(row * height) + _TITLE,
+            right=(column + 1) * width - _RIGHT,
+            bottom=round((row + 1) * height) - _BOTTOM,
+            low=low,
+            high=high,
+        )
+
+    def _x(self, panel: _Panel, index: int) -> float:
+        return panel.left + index / max(self.n - 1, 1) * (panel.right - panel.left)
+
+    def _drawn(self, *, with_curves: bool) -> np.ndarray:
+        from PIL import Image, ImageDraw
+
+        width, height = self.size
+        image = Image.new("RGB", (width * _SMOOTH, height * _SMOOTH), BACKGROUND)
+        draw = ImageDraw.Draw(image)
+        for panel in self.panels:
+            self._draw_axes(draw, panel)
+            if with_curves:
+                self._draw_curves(draw, panel)
+        return np.asarray(image.resize(self.size, Image.Resampling.LANCZOS))
+
+    def _draw_axes(self, draw: ImageDraw, panel: _Panel) -> None:
+        big = _big
+        draw.text(
+            big(panel.left - _LEFT + 12, panel.top - _TITLE / 2 - 1),
+            _shortened(title_of(panel.name), 30),
+            fill=INK,
+            font=font(13 * _SMOOTH),
+            anchor="lm",
+        )
+        small = font(10 * _SMOOTH)
+        for tick in ticks(panel.low, panel.high, 3):
+            y = panel.y(tick)
+            draw.line([big(panel.left, y), big(panel.right, y)], fill=GRID, width=_SMOOTH)
+            where = big(panel.left - 6, y)
+            draw.text(where, number_text(tick), fill=FAINT, font=small, anchor="rm")
+        for tick in ticks(0, max(self.n - 1, 1), 5):
+            if tick == int(tick):
+                where = big(self._x(panel, int(tick)), panel.bottom + 5)
+                draw.text(where, str(int(tick)), fill=FAINT, font=small, anchor="mt")
+        for index in self.breaks:
+            x = self._x(panel, index)
+            draw.line([big(x, panel.top), big(x, panel.bottom)], fill=FRAME, width=_SMOOTH)
+        corner = [big(panel.left, panel.top), big(panel.left, panel.bottom)]
+        draw.line([*corner, big(panel.right, panel.bottom)], fill=FRAME, width=_SMOOTH)
+
+    def _draw_curves(self, draw: ImageDraw, panel: _Panel) -> None:
+        for number, curve in enumerate(panel.curves.values()):
+            color = COLORS[number % len(COLORS)]
+            for start, values in self._segments(curve):
+                points = [
+                    _big(self._x(panel, start + offset), panel.y(value))
+                    for offset, value in enumerate(values)
+                ]
+                if len(points) > 1:
+                    draw.line(points, fill=color, width=round(1.6 * _SMOOTH), joint="curve")
+                else:
+                    draw.circle(points[0], 1.8 * _SMOOTH, fill=color)
+
+    def _segments(self, curve: Sequence[float | None]) -> Iterator[tuple[int, list[float]]]:
+        """Yield runs of numbers without gap and episode boundary, each with its first scene."""
+        start = 0
+        run: list[float] = []
+        for index, value in enumerate(curve):
+            if run and (value is None or index in self.breaks):
+                yield start, run
+                run = []
+            if value is not None:
+                if not run:
+                    start = index
+                run.append(value)
+        if run:
+            yield start, run
+
+    def _draw_cursor(self, draw: ImageDraw, panel: _Panel, index: int) -> None:
+        x = self._x(panel, index)
+        draw.line([(x, panel.top), (x, panel.bottom)], fill="#a1a1aa", width=1)
+        written = panel.right
+        for number, (label, curve) in reversed(list(enumerate(panel.curves.items()))):
+            value, color = curve[index], COLORS[number % len(COLORS)]
+            if value is not None:
+                draw.circle((x, panel.y(value)), 3, fill=color, outline=BACKGROUND)
+            text = NO_VALUE if value is None else number_text(value)
+            if label and len(panel.curves) <= 4:
+                text = f"{label}: {text}"
+            written = self._write_value(draw, panel, text, color, written)
+
+    @staticmethod
+    def _write_value(draw: ImageDraw, panel: _Panel, text: str, color: str, right: int) -> int:
+        """Write a current value left of the last one; return where the next one may end."""
+        letters = font(12)
+        width = draw.textlength(text, font=letters)
+        if right - width < panel.left + 9 * min(len(title_of(panel.name)), 30) - _LEFT + 12:
+            return 0
+        where = (right, panel.top - _TITLE / 2 - 1)
+        draw.text(where, text, fill=color, font=letters, anchor="rm")
+        return int(right - width - 10)
+
+
+def _big(x: float, y: float) -> tuple[float, float]:
+    return x * _SMOOTH, y * _SMOOTH
+
+
+def _shortened(text: str, length: int) -> str:
+    return text if len(text) <= length else f"…{text[1 - length :]}"

@@ -1,0 +1,1 @@
+"""One run: its parts, its directory, and its course from the configuration to the result."""

@@ -1,0 +1,217 @@
+"""The directory that a run leaves behind, and how to find it again."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import datetime as dt
+import json
+import re
+import secrets
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any
+
+import yaml
+
+from scilab_rl import files
+from scilab_rl.errors import ConfigError, did_you_mean
+from scilab_rl.results import RunResult
+
+CONFIG_FILE = "config.yaml"
+RESULT_FILE = "result.json"
+LAST_LINK = "last"
+LOCK_FILE = ".lock"
+_POLICY = "rl_model_"
+# The C loader is ten times faster, and there may be thousands of runs.
+_Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+
+
+class RunDirectory:
+    """The directory ``<base>/<date>/<time>-<env>-<algorithm>-s<seed>-<suffix>/`` of one run.
+
+    Args:
+        path: An existing directory.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    @classmethod
+    def create(cls, base: Path, env: str, algorithm: str, seed: int) -> RunDirectory:
+        """Create a directory that no other run has, however many start in the same second.
+
+        Uniqueness holds by construction: ``mkdir`` fails for all but one of the processes that
+        draw the same suffix.
+
+        Raises:
+            ConfigError: If the directory cannot be written.
+        """
+        now = dt.datetime.now()
+        name = f"{now:%H%M%S}-{slug(env)}-{slug(algorithm)}-s{seed}"
+        day = base / f"{now:%Y-%m-%d}"
+        try:
+            day.mkdir(parents=True, exist_ok=True)
+            while True:
+                path = day / f"{name}-{secrets.token_hex(2)}"
+                try:
+                    path.mkdir()
+                except FileExistsError:
+                    continue
+                return cls(path)
+        except OSError as error:
+            raise ConfigError(
+                f"The run directory cannot be created in '{base}': {error.strerror}. "
+                f"Choose another place with base_logdir=DIR."
+            ) from error
+
+    def __truediv__(self, name: str) -> Path:
+        return self.path / name
+
+    def __str__(self) -> str:
+        return str(self.path)
+
+    def discard(self) -> None:
+        """Remove the directory of a run that was refused before its first step."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        for folder in list(self.path.parents)[:2]:
+            with contextlib.suppress(OSError):  # another run lives there
+                folder.rmdir()
+
+    def write_result(self, result: RunResult) -> None:
+        """Replace ``result.json``."""
+        files.write_json(self / RESULT_FILE, dataclasses.asdict(result))
+
+    def read_result(self) -> RunResult | None:
+        """Return the stored result, or None when it is missing or damaged."""
+        try:
+            stored = json.loads((self / RESULT_FILE).read_text(encoding="utf-8"))
+            return RunResult(**stored)
+        except (OSError, ValueError, TypeError):
+            return None
+
+    def read_config(self) -> dict[str, Any]:
+        """Return the recorded configuration as plain data.
+
+        Raises:
+            ConfigError: If it is missing or damaged.
+        """
+        try:
+            config = yaml.load((self / CONFIG_FILE).read_text(encoding="utf-8"), Loader=_Loader)
+        except (OSError, ValueError, yaml.YAMLError) as error:
+            raise ConfigError(f"{CONFIG_FILE} cannot be read: {type(error).__name__}") from error
+        if not isinstance(config, dict) or not config:
+            raise ConfigError(f"{CONFIG_FILE} holds no configuration")
+        return config
+
+    @contextlib.contextmanager
+    def in_use(self) -> Iterator[None]:
+        """Mark the run as alive for the block; the kernel takes the mark back when we die.
+
+        Raises:
+            ConfigError: If another process works on this run.
+        """
+        with (self / LOCK_FILE).open("w") as file:
+            if not _lock_if_free(file):
+                raise ConfigError(f"Another process works on '{self}'; wait for it or stop it.")
+            yield
+
+    def is_in_use(self) -> bool:
+        """Return whether a process works on this run."""
+        try:
+            with (self / LOCK_FILE).open("r") as file:
+                return not _lock_if_free(file)
+        except OSError:
+            return False
+
+    def publish_as_last(self, base: Path) -> None:
+        """Let ``<base>/last`` point to this run."""
+        files.point_to(base / LAST_LINK, self.path)
+
+
+def _lock_if_free(file: IO[str]) -> bool:
+    try:
+        return files.lock(file, wait=False)
+    except OSError:  # a network drive without locks
+        return True
+
+
+def slug(text: str) -> str:
+    """Return a name that is safe as part of a file name.
+
+    >>> slug("ALE/Pong-v5")
+    'ALE_Pong-v5'
+    >>> slug("../../etc")
+    'etc'
+    """
+    return re.sub(r"[^A-Za-z0-9._-]+", "_", text).strip("._-")[:80] or "unnamed"
+
+
+def find_policy(run: RunDirectory, *names: str) -> Path:
+    """Return the folder of the first of these policies that exists.
+
+    Args:
+        run: A run.
+        names: ``best``, ``finished``, or paths of saved policies.
+
+    Raises:
+        ConfigError: If there is none.
+    """
+    saved = {path.name.removeprefix(_POLICY): path for path in run.path.glob(f"{_POLICY}*")}
+    for name in names:
+        if (Path(name) / "manifest.json").is_file():
+            return Path(name)
+        if name.removeprefix(_POLICY) in saved:
+            return saved[name.removeprefix(_POLICY)]
+    if not saved:
+        raise ConfigError(f"The run '{run}' has not saved a policy yet: it needs one epoch.")
+    raise ConfigError(f"There is no policy '{names[0]}'. The run has: {', '.join(sorted(saved))}.")
+
+
+def all_runs(base: Path) -> Iterator[RunDirectory]:
+    """Yield the runs below a base directory, oldest first."""
+    for config in sorted(base.glob(f"*/*/{CONFIG_FILE}")):
+        if not config.parent.parent.is_symlink():
+            yield RunDirectory(config.parent)
+
+
+def find_run(name: str, base: Path) -> RunDirectory:
+    """Find a run by ``last``, by its path, or by a unique part of its directory's name.
+
+    Args:
+        name: What the user typed; also the path of a saved policy inside a run.
+        base: Where runs live.
+
+    Raises:
+        ConfigError: If no run or more than one fits.
+    """
+    for path in (Path(name), base / name):
+        for candidate in (path, path.parent):
+            if (candidate / CONFIG_FILE).is_file():
+                return RunDirectory(candidate.resolve())
+    runs = {run.path.name: run for run in all_runs(base)}
+    fitting = [run for run_name, run in runs.items() if name and name in run_name]
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        raise ConfigError(
+            f"'{name}' fits {len(fitting)} runs in '{base}'; give more of the name, for example "
+            f"'{fitting[-1].path.name}'."
+        )
+    raise ConfigError(
+        f"No run '{name}' in '{base}'.{did_you_mean(name, runs)} "
+        "`scilab-rl runs` lists them; 'last' means the newest."
+    )
+
+
+def reports_success(run: RunDirectory) -> bool:
+    """Return whether any evaluation of a run has measured a success rate."""
+    return any("eval/success_rate" in row for row in read_epochs(run))
+
+
+def read_epochs(run: RunDirectory) -> list[dict[str, Any]]:
+    """Return the rows of ``metrics.jsonl`` that describe evaluations, oldest first."""
+    return [
+        row for row in files.read_json_lines(run / "metrics.jsonl") if row.get("kind") == "epoch"
+    ]

@@ -1,0 +1,131 @@
+"""An installation without extras trains, searches and compares, to the end of its reports."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from collections.abc import Iterable
+from importlib import metadata
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.commands import ROOT, TINY, command, quiet_environment
+from tests.unit.test_dependencies import declared
+
+SHORT = (TINY, "eval_after_n_steps=60", "n_epochs=2", "n_test_rollouts=2")
+# Makes everything look as if it were not installed that the core's dependencies do not bring.
+SITE = """
+import importlib.machinery, sys
+from pathlib import Path
+
+ALLOWED = set(Path(__file__).with_name("allowed.txt").read_text().split())
+
+
+class CoreAlone(importlib.machinery.PathFinder):
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        spec = super().find_spec(name, path, target)
+        if path is not None or spec is None or name in ALLOWED:
+            return spec
+        places = [spec.origin or "", *(spec.submodule_search_locations or ())]
+        return None if any("site-packages" in place for place in places) else spec
+
+
+at = sys.meta_path.index(importlib.machinery.PathFinder)
+sys.meta_path[at] = CoreAlone
+"""
+
+
+def with_requirements(names: Iterable[str]) -> set[str]:
+    """Return these distributions and all that they need themselves."""
+    found: set[str] = set()
+    waiting = list(names)
+    while waiting:
+        name = waiting.pop().lower().replace("_", "-")
+        if name in found or name == "scilab-rl":
+            continue
+        found.add(name)
+        try:
+            requirements = metadata.requires(name) or []
+        except metadata.PackageNotFoundError:
+            continue
+        waiting += [re.split(r"[\s\[<>=!;~(]", r)[0] for r in requirements if "extra ==" not in r]
+    return found
+
+
+@pytest.fixture(scope="module")
+def core_alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder for PYTHONPATH that leaves only the core importable."""
+    folder = tmp_path_factory.mktemp("core")
+    allowed = with_requirements(declared()[0])
+    modules = [
+        module
+        for module, distributions in metadata.packages_distributions().items()
+        if {name.lower().replace("_", "-") for name in distributions} & allowed
+    ]
+    (folder / "allowed.txt").write_text("\n".join(modules))
+    (folder / "sitecustomize.py").write_text(SITE)
+    return folder
+
+
+def run(core_alone: Path, cwd: Path, *arguments: str) -> subprocess.CompletedProcess:
+    paths = f"{core_alone}:{ROOT / 'src'}"
+    return subprocess.run(
+        [sys.executable, *command(*arguments)[1:]], cwd=cwd, text=True, capture_output=True,
+        timeout=240, check=False, env=quiet_environment(PYTHONPATH=paths),
+    )  # fmt: skip
+
+
+def test_extras_are_out_of_reach(core_alone: Path, tmp_path: Path) -> None:
+    code = "import matplotlib, PIL, yaml\nimport mlflow"
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=quiet_environment(PYTHONPATH=str(core_alone)),
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert "No module named 'mlflow'" in done.stderr
+
+
+def test_an_experiment_ends_with_its_report(core_alone: Path, tmp_path: Path) -> None:
+    words = ("experiment", "base=random", "variant=two:random,n_envs=2", "seeds=2", *SHORT)
+    done = run(core_alone, tmp_path, *words)
+    assert done.returncode == 0, done.stderr
+    (page,) = tmp_path.glob("data/comparisons/*/comparison.html")
+    assert page.stat().st_size > 10_000
+
+
+def test_a_study_ends_with_its_report(core_alone: Path, tmp_path: Path) -> None:
+    words = ("algorithm=sac", *SHORT, "algorithm.buffer_size=500", "--multirun",
+             "algorithm.learning_starts=1000", "require_updates=false",
+             "algorithm.gamma=interval(0.9,0.99)",
+             "hydra.sweeper.max_trials=2", "hydra.sweeper.min_trials_per_param=1",
+             "hydra.sweeper.n_final_runs=0", "hydra.sweeper.study_name=mine")  # fmt: skip
+    done = run(core_alone, tmp_path, *words)
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "data/studies/mine/report.html").stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_all_that_reports(core_alone: Path, tmp_path: Path) -> None:
+    """Performance tests, films and recorded episodes, with the simulator of the core."""
+    folder = tmp_path / "conf" / "performance"
+    folder.mkdir(parents=True)
+    (folder / "tiny-test.yaml").write_text(
+        "# @package _global_\ndefaults:\n  - override /algorithm: random\n"
+        "env: scilab_rl.testing:TinyBox-v0\neval_after_n_steps: 20\n"
+        "performance_testing_conditions:\n  eval_columns: eval/mean_reward\n"
+        "  eval_value: -500\n  max_steps: 40\n  margin: 400\n  n_episodes: 5\n"
+    )
+    short = ("env=FetchReach", "eval_after_n_steps=60", "n_epochs=1", "n_test_rollouts=1", "seed=1")
+    for words in (
+        ("performance", "tiny-test"),
+        ("algorithm=random", *short, "render=record", "render_freq=1"),
+        ("play", "last", "--episodes", "1", "--record"),
+        ("export", "last", "--episodes", "1"),
+        ("doctor",),
+    ):
+        done = run(core_alone, tmp_path, *words)
+        assert done.returncode == 0, (words, done.stderr, done.stdout)
+    assert list(tmp_path.glob("data/performance/*.html"))
+    assert list(tmp_path.glob("data/last/episodes/*.mp4"))
