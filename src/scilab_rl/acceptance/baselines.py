@@ -20,7 +20,7 @@ from scilab_rl.files import write_json
 BASELINES = Path("baselines")
 _FEWEST_RUNS = 3
 # The packages of a run that affect what it learns and how fast.
-_PACKAGES = (
+PACKAGES = (
     "scilab-rl", "torch", "numpy", "stable_baselines3", "sb3-contrib", "gymnasium",
     "gymnasium-robotics", "mujoco", "jax", "jaxlib", "optax", "metaworld", "highway-env",
 )  # fmt: skip
@@ -79,7 +79,7 @@ def write_baseline(result: TestResult, verdict: Verdict, folder: Path) -> Path:
             "definition": result.definition,
             "source": {
                 **source,
-                "versions": {name: versions[name] for name in _PACKAGES if name in versions},
+                "versions": {name: versions[name] for name in PACKAGES if name in versions},
             },
             "runs": runs,
         },

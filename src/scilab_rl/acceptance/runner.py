@@ -8,20 +8,19 @@ import hashlib
 import json
 import logging
 import math
-import platform
 import signal
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from scilab_rl import machine
 from scilab_rl.acceptance.conditions import REFERENCE, Conditions, read_conditions
 from scilab_rl.acceptance.results import TestResult, TestRun, load_result
 from scilab_rl.acceptance.rules import OPEN
 from scilab_rl.config.compose import compose
 from scilab_rl.config.schema import learning_config, learning_part
 from scilab_rl.errors import ScilabRLError
-from scilab_rl.machine import n_cores
 from scilab_rl.parallel.jobs import JobPool
 from scilab_rl.parallel.pool import Pool
 from scilab_rl.parallel.worker import Message, Task
@@ -252,7 +251,7 @@ def read_source(run_dir: Path) -> dict[str, object]:
     kept = ("git_commit", "git_changed", "fingerprint", "python", "platform", "versions")
     return {
         **{key: stored.get(key) for key in kept},
-        "machine": {"processor": _processor(), "cores": n_cores()},
+        "machine": machine.describe(),
     }
 
 
@@ -289,14 +288,6 @@ def _finished_run(test: PerformanceTest, number: int, content: Mapping[str, Any]
         curve=tuple(round(value, 4) for value in content["values"]),
         run_dir=content["run_dir"],
     )
-
-
-def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model n"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
 
 
 @contextlib.contextmanager

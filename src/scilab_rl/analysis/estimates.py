@@ -54,6 +54,18 @@ AGGREGATES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
+def success_interval(n_successes: int, n_episodes: int) -> Estimate:
+    """Return a success rate with Wilson's interval, which holds for rates near 0 and 1 too.
+
+    >>> str(success_interval(20, 20))
+    '1 [0.839, 1]'
+    """
+    from scipy import stats  # heavy
+
+    interval = stats.binomtest(n_successes, n_episodes).proportion_ci(method="wilson")
+    return Estimate(n_successes / n_episodes, float(interval.low), float(interval.high))
+
+
 def aggregate(scores: Scores, name: str, *, seed: int = 0) -> Estimate:
     """Return an aggregate over all runs of all tasks with its bootstrap interval.
 

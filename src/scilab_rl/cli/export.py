@@ -1,4 +1,4 @@
-"""``scilab-rl export RUN --trials``: a tidy table for statistics and cognitive models."""
+"""``scilab-rl export RUN``: a tidy table for statistics, or with ``--agent`` a trained agent."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from scilab_rl import files
 from scilab_rl.cli.parser import CommandParser, positive
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.schema import RunConfig
-from scilab_rl.config.workspace import open_project
+from scilab_rl.config.workspace import PROJECT_AGENTS, open_project
 from scilab_rl.errors import ConfigError
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run
 
@@ -25,6 +25,8 @@ def main(arguments: list[str]) -> int:
     from scilab_rl.analysis.report import write_table
 
     run = find_run(options.run, options.base_logdir)
+    if options.agent:
+        return _agent(run, options)
     cfg = load_recorded(run / CONFIG_FILE)
     rows = _training_episodes(run) if options.training else _trials(run, cfg, options)
     origin = {
@@ -34,12 +36,30 @@ def main(arguments: list[str]) -> int:
         "run_seed": cfg.seed,
     }
     kind = "training" if options.training else f"trials_{options.per}"
-    path = options.output or run / f"{kind}.{options.format}"
+    path = options.output or run.outputs / f"{kind}.{options.format}"
     if path.suffix not in (".csv", ".parquet"):
         raise ConfigError(f"--output must end in .csv or .parquet, but it is '{path}'.")
     path.parent.mkdir(parents=True, exist_ok=True)
     write_table([{**origin, **row} for row in rows], path)
     _log.info("%d rows: %s", len(rows), path)
+    return 0
+
+
+def _agent(run: RunDirectory, options: argparse.Namespace) -> int:
+    """Write a trained agent and its card."""
+    from scilab_rl.acceptance.agents import PAGE_FILE, write_agent
+
+    run.refuse_agent()
+    policy = find_policy(run, options.run, options.policy)
+    folder = write_agent(
+        run,
+        policy,
+        options.agent,
+        options.output or PROJECT_AGENTS,
+        n_episodes=options.episodes or 1000,
+        licence=options.licence,
+    )
+    _log.info("%s\n%s", (folder / PAGE_FILE).read_text(encoding="utf-8"), folder)
     return 0
 
 
@@ -56,7 +76,7 @@ def _trials(
     if options.softmax is not None:
         choose = softmax_choice(model, options.softmax, seed)
     rows = collect(
-        model, env, options.episodes, seed, choose=choose, most_dimensions=options.dimensions
+        model, env, options.episodes or 20, seed, choose=choose, most_dimensions=options.dimensions
     )
     env.close()
     chosen = by_episode(rows) if options.per == "episode" else rows
@@ -78,7 +98,8 @@ def _training_episodes(run: RunDirectory) -> Sequence[Mapping[str, object]]:
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = CommandParser(
         "export",
-        "Write the observations, actions and metrics of an agent as a tidy table.",
+        "Write the observations, actions and metrics of an agent as a tidy table, or keep the "
+        "agent itself under a name, with a card that says how good it is.",
         run=True,
         base=True,
     )
@@ -88,8 +109,13 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         "--trials", action="store_true", help="new episodes of its policy (the default)"
     )
     what.add_argument("--training", action="store_true", help="the recorded training episodes")
+    what.add_argument(
+        "--agent",
+        metavar="NAME",
+        help="keep the policy as agent:NAME, and measure it: agents/NAME/README.md",
+    )
     add("--per", choices=("step", "episode"), default="step", help="what a row is; default: a step")
-    add("--episodes", type=positive, default=20, help="default: 20")
+    add("--episodes", type=positive, help="default: 20; of an agent: 1000, over 5 seeds")
     add("--policy", choices=("best", "finished"), default="finished")
     add(
         "--softmax",
@@ -100,5 +126,12 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     add("--dimensions", type=positive, default=12, help="most numbers of an observation's parts")
     add("--seed", type=int, default=0, help="default: the run's seed plus 1")
     add("--format", choices=("csv", "parquet"), default="csv")
-    add("--output", type=Path, metavar="FILE", help="default: inside the run's folder")
+    add("--licence", default="MIT", help="of an agent; default: MIT, as Scilab-RL")
+    add(
+        "--output",
+        type=Path,
+        metavar="PATH",
+        help="the table's file, default: inside the run's folder; the folder of agents, default: "
+        "agents",
+    )
     return parser.parse_args(arguments)

@@ -31,7 +31,9 @@ class CommandParser(argparse.ArgumentParser):
     ) -> None:
         super().__init__(prog=f"scilab-rl {command}", description=description, allow_abbrev=False)
         if run:
-            self.add_argument("run", help="'last', the path of a run, or a part of its name")
+            self.add_argument(
+                "run", help="'last', agent:NAME, the path of a run, or a part of its name"
+            )
         if base:
             self.add_argument(
                 "--base-logdir",

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scilab_rl.analysis.estimates import success_interval
 from scilab_rl.cli.parser import CommandParser, positive
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.schema import RunConfig
@@ -19,6 +20,7 @@ from scilab_rl.errors import ConfigError
 from scilab_rl.run.directory import (
     CONFIG_FILE,
     RunDirectory,
+    all_agents,
     find_policy,
     find_run,
     reports_success,
@@ -108,7 +110,7 @@ def film_first_episode(
     from scilab_rl.recording import callback
     from scilab_rl.recording.records import FOLDER, SUFFIX, ClipInfo
 
-    folder = run / FOLDER
+    folder = run.outputs / FOLDER
     number = len(list(folder.glob(f"play_*{SUFFIX}"))) + 1
     clip = ClipInfo(f"play_{number:03d}", "eval", 0, cfg.env, cfg.algorithm.name, 0.0, ())
     names = metrics.split(",") if metrics else default_metrics(model)
@@ -129,6 +131,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         run=True,
         base=True,
     )
+    parser.epilog = f"Trained agents, as RUN: {', '.join(f'agent:{name}' for name in all_agents())}"
     parser.add_argument(
         "overrides",
         nargs="*",
@@ -166,8 +169,6 @@ def _play(model: Algorithm, env: VecEnv, options: argparse.Namespace, seed: int)
 def _report(
     values: Mapping[str, float], evaluation: Evaluation, cfg: RunConfig, video: Path | None
 ) -> None:
-    from scipy import stats  # heavy
-
     from scilab_rl.tracking.console import print_table
 
     episodes = evaluation.episodes
@@ -175,9 +176,9 @@ def _report(
     rows = [("environment", cfg.env), ("algorithm", cfg.algorithm.name)]
     rows.append(("episodes", str(len(episodes))))
     if (rate := values.get("eval/success_rate")) is not None:
-        n_successes = round(rate * len(episodes))
-        low, high = stats.binomtest(n_successes, len(episodes)).proportion_ci(method="wilson")
-        rows.append(("success", f"{rate:.2f} (95 % interval {low:.2f} to {high:.2f})"))
+        found = success_interval(round(rate * len(episodes)), len(episodes))
+        interval = f"95 % interval {found.low:.2f} to {found.high:.2f}"
+        rows.append(("success", f"{rate:.2f} ({interval})"))
     if n_silent := int(values.get("eval/success_not_reported", 0)):
         rows.append(("not reported", f"{n_silent} episodes, counted as not successful"))
     rows.append(

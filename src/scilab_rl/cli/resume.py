@@ -27,6 +27,7 @@ def main(arguments: list[str]) -> int:
 
     open_project()
     directory = find_run(options.run, options.base_logdir)
+    directory.refuse_agent()
     cfg = load_recorded(directory / CONFIG_FILE, options.overrides)
     return resume_run(cfg, directory).exit_code
 

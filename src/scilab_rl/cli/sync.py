@@ -30,7 +30,9 @@ def main(arguments: list[str]) -> int:
         raise MissingDependencyError(options.to, options.to, "to send runs there")
     send = _log_wandb_command if options.to == "wandb" else _send
     if options.run != "all":
-        send(find_run(options.run, options.base_logdir), options)
+        run = find_run(options.run, options.base_logdir)
+        run.refuse_agent()
+        send(run, options)
         return 0
     n_failed = 0
     for run in all_runs(options.base_logdir):

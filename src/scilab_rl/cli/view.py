@@ -50,7 +50,8 @@ def recordings_of(run: RunDirectory) -> list[Path]:
     Raises:
         ConfigError: If there are none.
     """
-    recordings = sorted((run / FOLDER).glob(f"*{SUFFIX}"), key=lambda path: path.stat().st_mtime)
+    paths = (run.outputs / FOLDER).glob(f"*{SUFFIX}")
+    recordings = sorted(paths, key=lambda path: path.stat().st_mtime)
     if not recordings:
         raise ConfigError(
             f"The run '{run}' has recorded no episode. Train with render=record, or record its "

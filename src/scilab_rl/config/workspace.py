@@ -1,4 +1,4 @@
-"""The project folder: where a researcher keeps her own YAML, algorithms and environments."""
+"""The project folder: where a researcher keeps her YAML, algorithms, environments and agents."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from pathlib import Path
 from scilab_rl.errors import ConfigError
 
 SHIPPED_CONF = Path(__file__).parents[1] / "conf"
+SHIPPED_AGENTS = Path(__file__).resolve().parents[1] / "agents"
 PROJECT_CONF = Path("conf")
+PROJECT_AGENTS = Path("agents")
 PROJECT_ALGORITHMS = Path("src/custom_algorithms")
 PROJECT_ENVS = "custom_envs"
 

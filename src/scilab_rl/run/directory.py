@@ -16,6 +16,7 @@ from typing import IO, Any
 import yaml
 
 from scilab_rl import files
+from scilab_rl.config.workspace import PROJECT_AGENTS, SHIPPED_AGENTS
 from scilab_rl.errors import ConfigError, did_you_mean
 from scilab_rl.results import RunResult
 
@@ -23,6 +24,7 @@ CONFIG_FILE = "config.yaml"
 RESULT_FILE = "result.json"
 LAST_LINK = "last"
 LOCK_FILE = ".lock"
+AGENT = "agent:"
 _POLICY = "rl_model_"
 # The C loader is ten times faster, and there may be thousands of runs.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
@@ -31,12 +33,22 @@ _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 class RunDirectory:
     """The directory ``<base>/<date>/<time>-<env>-<algorithm>-s<seed>-<suffix>/`` of one run.
 
+    A trained agent has the same files as a run, but nothing is written into its directory.
+
     Args:
         path: An existing directory.
+        outputs: Where commands write what they make of it; None: into the directory itself.
+
+    Attributes:
+        path: The directory.
+        outputs: Where commands write; may not exist yet.
+        is_agent: Whether it is a trained agent, which neither learns nor changes.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, outputs: Path | None = None) -> None:
         self.path = path
+        self.outputs = outputs or path
+        self.is_agent = outputs is not None
 
     @classmethod
     def create(cls, base: Path, env: str, algorithm: str, seed: int) -> RunDirectory:
@@ -70,7 +82,7 @@ class RunDirectory:
         return self.path / name
 
     def __str__(self) -> str:
-        return str(self.path)
+        return f"{AGENT}{self.path.name}" if self.is_agent else str(self.path)
 
     def discard(self) -> None:
         """Remove the directory of a run that was refused before its first step."""
@@ -125,6 +137,18 @@ class RunDirectory:
         except OSError:
             return False
 
+    def refuse_agent(self) -> None:
+        """Reject a trained agent where only a run makes sense.
+
+        Raises:
+            ConfigError: With what can be done with an agent.
+        """
+        if self.is_agent:
+            raise ConfigError(
+                f"{self} is a trained agent, not a run of yours: play, record, view, probe, export "
+                f"or compare it, or start a run from its policy with restore_policy={self}."
+            )
+
     def publish_as_last(self, base: Path) -> None:
         """Let ``<base>/last`` point to this run."""
         files.point_to(base / LAST_LINK, self.path)
@@ -153,20 +177,56 @@ def find_policy(run: RunDirectory, *names: str) -> Path:
 
     Args:
         run: A run.
-        names: ``best``, ``finished``, or paths of saved policies.
+        names: ``best``, ``finished``, ``agent:NAME``, or paths of saved policies.
 
     Raises:
         ConfigError: If there is none.
     """
     saved = {path.name.removeprefix(_POLICY): path for path in run.path.glob(f"{_POLICY}*")}
     for name in names:
-        if (Path(name) / "manifest.json").is_file():
-            return Path(name)
+        if (policy_path(name) / "manifest.json").is_file():
+            return policy_path(name)
         if name.removeprefix(_POLICY) in saved:
             return saved[name.removeprefix(_POLICY)]
     if not saved:
         raise ConfigError(f"The run '{run}' has not saved a policy yet: it needs one epoch.")
     raise ConfigError(f"There is no policy '{names[0]}'. The run has: {', '.join(sorted(saved))}.")
+
+
+def policy_path(name: str) -> Path:
+    """Return the folder of a policy that ``agent:NAME`` or a path names.
+
+    Raises:
+        ConfigError: If there is no such agent.
+    """
+    if name.startswith(AGENT):
+        return find_agent(name.removeprefix(AGENT)) / f"{_POLICY}finished"
+    return Path(name)
+
+
+def all_agents() -> dict[str, Path]:
+    """Return the folders of the trained agents by name, shipped ones and those of the project."""
+    configs = (
+        config
+        for folder in (SHIPPED_AGENTS, PROJECT_AGENTS)
+        for config in sorted(folder.glob(f"*/{CONFIG_FILE}"))
+    )
+    return {config.parent.name: config.parent for config in configs}
+
+
+def find_agent(name: str) -> Path:
+    """Return the folder of a trained agent.
+
+    Raises:
+        ConfigError: If there is none of this name.
+    """
+    agents = all_agents()
+    if name not in agents:
+        raise ConfigError(
+            f"There is no agent '{name}'.{did_you_mean(name, agents)} There are: "
+            f"{', '.join(sorted(agents)) or 'none'}."
+        )
+    return agents[name]
 
 
 def all_runs(base: Path) -> Iterator[RunDirectory]:
@@ -177,7 +237,7 @@ def all_runs(base: Path) -> Iterator[RunDirectory]:
 
 
 def find_run(name: str, base: Path) -> RunDirectory:
-    """Find a run by ``last``, by its path, or by a unique part of its directory's name.
+    """Find a run by ``last``, ``agent:NAME``, its path, or a unique part of its directory's name.
 
     Args:
         name: What the user typed; also the path of a saved policy inside a run.
@@ -186,10 +246,11 @@ def find_run(name: str, base: Path) -> RunDirectory:
     Raises:
         ConfigError: If no run or more than one fits.
     """
-    for path in (Path(name), base / name):
+    known = [find_agent(name.removeprefix(AGENT))] if name.startswith(AGENT) else []
+    for path in (*known, Path(name), base / name):
         for candidate in (path, path.parent):
             if (candidate / CONFIG_FILE).is_file():
-                return RunDirectory(candidate.resolve())
+                return _opened(candidate.resolve(), base)
     runs = {run.path.name: run for run in all_runs(base)}
     fitting = [run for run_name, run in runs.items() if name and name in run_name]
     if len(fitting) == 1:
@@ -203,6 +264,11 @@ def find_run(name: str, base: Path) -> RunDirectory:
         f"No run '{name}' in '{base}'.{did_you_mean(name, runs)} "
         "`scilab-rl runs` lists them; 'last' means the newest."
     )
+
+
+def _opened(path: Path, base: Path) -> RunDirectory:
+    is_agent = path.parent in (SHIPPED_AGENTS, PROJECT_AGENTS.resolve())
+    return RunDirectory(path, base / "agents" / path.name if is_agent else None)
 
 
 def reports_success(run: RunDirectory) -> bool:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
@@ -15,6 +14,7 @@ from scilab_rl.config.schema import RunConfig, is_enabled
 from scilab_rl.config.workspace import config_files
 from scilab_rl.errors import ConfigError, RenderingError
 from scilab_rl.run.checks import algorithm_class
+from scilab_rl.run.directory import policy_path
 from scilab_rl.tracking.background import BackgroundTracker
 from scilab_rl.tracking.base import Tracker, TrackerGroup
 from scilab_rl.tracking.files import FilesTracker
@@ -88,7 +88,7 @@ def restore_policy(cfg: RunConfig, algorithm: Algorithm) -> None:
         return
     from scilab_rl.training.policy import load_policy
 
-    load_policy(algorithm, Path(cfg.restore_policy))
+    load_policy(algorithm, policy_path(cfg.restore_policy))
     _log.info("Policy restored from %s.", cfg.restore_policy)
 
 

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from importlib import metadata
 from typing import TYPE_CHECKING
 
-from scilab_rl import files
+from scilab_rl import files, machine
 from scilab_rl.config.schema import ALIASES, Values
 from scilab_rl.errors import ConfigError
 from scilab_rl.redaction import redact
@@ -46,12 +46,23 @@ def write(directory: RunDirectory, overrides: Sequence[str], env: gym.Env) -> No
             "overrides": [redact(override) for override in overrides],
             "git_commit": _git("rev-parse", "HEAD").strip() or None,
             "git_changed": bool(diff),
-            "fingerprint": _fingerprint(env),
+            "fingerprint": fingerprint_of(env),
             "python": platform.python_version(),
             "platform": platform.platform(),
+            "machine": machine.describe() | _gpu(),
             "versions": {d.name: d.version for d in sorted(metadata.distributions(), key=_name)},
         },
     )
+
+
+def fingerprint_of(env: gym.Env) -> str | None:
+    """Return the fingerprint; None for an environment that fails, which training will tell."""
+    from scilab_rl.envs.fingerprint import fingerprint
+
+    try:
+        return fingerprint(env)
+    except Exception:  # noqa: BLE001 - any environment may fail in its own way
+        return None
 
 
 def fingerprint_differences(runs: Iterable[RunDirectory]) -> list[str]:
@@ -108,14 +119,16 @@ def _difference(env_id: str, sources: Mapping[str, Sequence[Values]]) -> str:
     )
 
 
-def _fingerprint(env: gym.Env) -> str | None:
-    """Return the fingerprint; None for an environment that fails, which training will tell."""
-    from scilab_rl.envs.fingerprint import fingerprint
+def _gpu() -> dict[str, str]:
+    """Return the name of the GPU that PyTorch or JAX would use, if there is one."""
+    import torch
 
-    try:
-        return fingerprint(env)
-    except Exception:  # noqa: BLE001 - any environment may fail in its own way
-        return None
+    if torch.cuda.is_available():
+        return {"gpu": torch.cuda.get_device_name()}
+    jax = sys.modules.get("jax")  # only algorithms that are compiled by JAX import it
+    if jax is not None and jax.default_backend() != "cpu":
+        return {"gpu": jax.devices()[0].device_kind}
+    return {}
 
 
 def _name(distribution: metadata.Distribution) -> str:

@@ -283,7 +283,9 @@ class _Restore:
         return saved.clone()
 
     def _put_array(self, current: object, node: Node) -> np.ndarray:
-        saved = self.snapshot.arrays[node["name"]]
+        name = node["name"]
+        shared = self.snapshot.tensors.get(name)  # by `compact`
+        saved = self.snapshot.arrays[name] if shared is None else shared.numpy()
         if isinstance(current, np.ndarray) and current.flags.writeable:
             if (current.shape, current.dtype) == (saved.shape, saved.dtype):
                 current[...] = saved
@@ -338,7 +340,11 @@ class _Restore:
         return restored
 
     def _put_module(self, current: torch.nn.Module, node: Node) -> torch.nn.Module:
-        saved = {name: self.snapshot.tensors[f"{node['path']}.{name}"] for name in node["names"]}
+        same = node.get("same", {})  # target networks, by `compact`
+        saved = {
+            name: self.snapshot.tensors[f"{node['path']}.{same.get(name, name)}"]
+            for name in node["names"]
+        }
         current.load_state_dict(saved, strict=False)
         missing = set(current.state_dict()) - set(saved)
         if any(isinstance(current.state_dict()[name], torch.Tensor) for name in missing):
