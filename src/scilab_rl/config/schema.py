@@ -153,7 +153,10 @@ class RunConfig:
 
     device: str = _neutral("auto", "auto, cpu, cuda, cuda:0, mps", heading="The machine")
     n_threads: int = _neutral(
-        1, "CPU threads of PyTorch; 1 is fastest for small networks", low=1, high=4096
+        1,
+        "CPU threads of PyTorch, JAX and NumPy; 1 is fastest for small networks",
+        low=1,
+        high=4096,
     )
 
     algorithm: AlgorithmConfig = dataclasses.field(default_factory=AlgorithmConfig)

@@ -168,7 +168,9 @@ class OneFileAlgorithm(ABC):
             What happened, or None if the callback stops; the step is then forgotten.
         """
         new_obs: Any
-        new_obs, rewards, dones, infos = self.env.step(actions)
+        self.env.step_async(actions)
+        self.while_stepping()
+        new_obs, rewards, dones, infos = self.env.step_wait()
         self.num_timesteps += self.n_envs
         callback.update_locals(
             {
@@ -185,6 +187,9 @@ class OneFileAlgorithm(ABC):
         step = decode_step(self._last_obs, actions, new_obs, rewards, dones, infos)
         self._last_obs = new_obs
         return step
+
+    def while_stepping(self) -> None:  # noqa: B027 - nothing to do is a full answer
+        """Do what can be done while the environments step; nothing by default."""
 
     def to_vector(self, observations: Observation | Tensors) -> torch.Tensor:
         """Turn observations of any kind into one vector each.

@@ -255,10 +255,6 @@ def prepare_jax(device: str) -> jax.Device:
     Raises:
         ConfigError: If JAX has no such device.
     """
-    if torch.get_num_threads() == 1:  # n_threads=1; read when JAX first computes
-        flags = os.environ.get("XLA_FLAGS", "")
-        if "xla_cpu_multi_thread_eigen" not in flags:
-            os.environ["XLA_FLAGS"] = f"{flags} --xla_cpu_multi_thread_eigen=false".strip()
     # A run takes the memory that it needs, so that several share a GPU, also with PyTorch.
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
     cache = Path(os.environ.get("XDG_CACHE_HOME", Path.home() / ".cache")) / "scilab-rl" / "jax"
@@ -269,12 +265,20 @@ def prepare_jax(device: str) -> jax.Device:
     else:
         jax.config.update("jax_compilation_cache_dir", str(cache))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    given = os.environ.get("NPROC")
+    if torch.get_num_threads() == 1:  # n_threads=1
+        os.environ["NPROC"] = "1"  # the size of XLA's thread pool, read when it is made
     try:
         return jax.devices(None if device == "auto" else device)[0]
     except RuntimeError as error:
         raise ConfigError(
             f"JAX has no device '{device}' here, only {jax.default_backend()}; use device=auto."
         ) from error
+    finally:
+        if given is None:
+            os.environ.pop("NPROC", None)
+        else:
+            os.environ["NPROC"] = given
 
 
 def return_bounds(rewards: np.ndarray, gamma: float, bounds: np.ndarray) -> np.ndarray:

@@ -148,6 +148,7 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
             self.n_observations, active=normalize_observations, n_flags=self.relay is not None
         )
         self.reward_bounds = np.array([np.inf, -np.inf])
+        self._batch: Batch | None = None  # of the next round
         self._jax_device = device
 
     def start_learning(
@@ -178,16 +179,26 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
 
     def iterate(self, callback: BaseCallback) -> bool:
         """Collect steps while the last round of updates computes, then start the next round."""
-        if not self.collect(callback):
+        is_collected = self.collect(callback)
+        batch, self._batch = self._batch, None  # which nothing that is saved contains
+        if not is_collected:
             return False
-        is_due = self.num_timesteps > self.learning_starts
-        batch = self.draw(self.updates_per_round) if is_due else None
+        if batch is None and self.num_timesteps > self.learning_starts:
+            batch = self.draw(self.updates_per_round)
         self.finish_round()
         if batch is not None:
             self.rounds.start(batch)
         if not self.overlap:
             self.finish_round()
         return True
+
+    def while_stepping(self) -> None:
+        """Draw the transitions of the next round, in which the present steps cannot be yet.
+
+        The first round is drawn after its steps, since an episode must have ended by then.
+        """
+        if self.overlap and self._batch is None and self.rounds.n_started:
+            self._batch = self.draw(self.updates_per_round)
 
     def train(self, gradient_steps: int) -> None:
         """Do a round of updates, and wait for it."""
@@ -205,6 +216,11 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
         actions = self.act(vectors, deterministic=False)
         is_random = torch.as_tensor(np.random.random((self.n_envs, 1)) < self.random_share)
         return torch.where(is_random, random_actions, actions)
+
+    def draw_random_actions(self) -> Tensor:
+        """Draw an action in [-1, 1] for each environment, all at once."""
+        actions = np.random.uniform(-1.0, 1.0, (self.n_envs, self.n_actions))
+        return torch.as_tensor(actions, dtype=torch.float32)
 
     @property
     def random_share(self) -> float:

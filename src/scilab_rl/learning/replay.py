@@ -41,7 +41,6 @@ from scilab_rl.relabeling import INFO_KEYS
 GOAL_STRATEGIES = ("future", "final", "episode", "random")
 # An achieved goal that stays within this range in every dimension has not moved (metres).
 _REST = 0.01
-_MOST_REDRAWS = 50  # then a still episode will do
 # Rows of `HindsightReplayBuffer._cursors`.
 _OLDEST, _START, _NOW = range(3)
 _MIN_ROWS = 4
@@ -101,7 +100,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
             step on in the same episode; ``final``, the one reached at its end; ``episode``, any of
             it; ``random``, any of all episodes. In the paper ``future`` does best, with k = 4 or 8.
         moved_share: Share of transitions that are drawn only from episodes in which the achieved
-            goal moved, as far as there are any; the others are drawn from all.
+            goal moved, once there are any; the others are drawn from all.
         desired_share: Share of relabeled transitions whose goal is the desired goal of a step that
             is drawn from all episodes, instead of one that was reached.
         relay: The two goals of relay hindsight, see `Relay`; samples then end with its flag.
@@ -162,10 +161,11 @@ class HindsightReplayBuffer(HerReplayBuffer):
         # Steps from the beginning of the episode to this row, and from here to its last row.
         self.steps_before = np.zeros((n_rows, n_envs), np.int32)
         self.steps_left = np.zeros((n_rows, n_envs), np.int32)
-        self.moved = np.zeros((n_rows, n_envs), bool)
         # Rows are counted without end; modulo n_rows it is where they lie. The oldest episode's
         # first row, the running episode's first row, and the row where it is now.
         self._cursors = np.zeros((3, n_envs), np.int64)
+        # Of each ended episode in which the achieved goal moved: environment, first row, length.
+        self._moved = np.zeros((0, 3), np.int64)
         self._judge_by(env)
 
     def __getstate__(self) -> dict[str, object]:
@@ -182,6 +182,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
         """Forget everything."""
         super().reset()
         self._cursors[:] = 0
+        self._moved = self._moved[:0]
 
     def add(  # type: ignore[override]
         self,
@@ -323,14 +324,17 @@ class HindsightReplayBuffer(HerReplayBuffer):
             self.steps_before[rows, index] = np.arange(length + 1)
             self.steps_left[rows, index] = np.arange(length, -1, -1)
             reached = self.rows[rows, index, self._columns["achieved_goal"]]
-            self.moved[rows, index] = np.ptp(reached, axis=0).max() > _REST
+            if np.ptp(reached, axis=0).max() > _REST:
+                self._moved = np.vstack([self._moved, [index, start[index], length]])
             now[index] += 1
             start[index] = now[index]
 
     def _make_room(self) -> None:
         """Drop the oldest episodes where the next two rows would be written into them."""
         oldest, start, now = self._cursors
+        dropped = False
         while len(short := (oldest + self.buffer_size <= now + 1).nonzero()[0]):
+            dropped = True
             for index in short:
                 if oldest[index] < start[index]:
                     row = oldest[index] % self.buffer_size
@@ -338,6 +342,9 @@ class HindsightReplayBuffer(HerReplayBuffer):
                 else:  # an episode longer than the ring forgets its first step
                     oldest[index] += 1
                     start[index] += 1
+        if dropped:
+            env, first, _ = self._moved.T
+            self._moved = self._moved[first >= oldest[env]]
 
     def _relabel(self, batch: Transitions, chosen: np.ndarray, cells: np.ndarray) -> None:
         """Put other goals into the chosen transitions, which come from these cells."""
@@ -384,23 +391,30 @@ class HindsightReplayBuffer(HerReplayBuffer):
                 " must be greater than the longest episode times the number of environments."
             )
         cells = np.empty(n, np.int64)
-        missing = np.arange(n)
-        n_redraws = 0
-        picky = np.zeros(n, bool)
-        if self.moved_share and self.moved.any():
-            picky = self.random.random(n) < self.moved_share
+        from_moved = np.zeros(n, bool)
+        if self.moved_share and len(self._moved):
+            from_moved = self.random.random(n) < self.moved_share
+            cells[from_moved] = self._draw_moved_cells(int(from_moved.sum()))
+        (missing,) = (~from_moved).nonzero()
         while len(missing):
             drawn = self.random.integers(ends[-1], size=len(missing))
             env = np.searchsorted(ends, drawn, side="right")
-            row = drawn - ends[env] + start[env]
-            cells[missing] = row % self.buffer_size * self.n_envs + env
+            cells[missing] = self._cell(env, drawn - ends[env] + start[env])
             # The last row of an episode begins no transition.
-            refused = self.steps_left.reshape(-1)[cells[missing]] == 0
-            if n_redraws < _MOST_REDRAWS:
-                refused |= picky[missing] & ~self.moved.reshape(-1)[cells[missing]]
-            missing = missing[refused]
-            n_redraws += 1
+            missing = missing[self.steps_left.reshape(-1)[cells[missing]] == 0]
         return cells
+
+    def _draw_moved_cells(self, n: int) -> np.ndarray:
+        """Draw transitions of episodes in which the achieved goal moved. Shapes: ``(n,)``."""
+        env, first, length = self._moved.T
+        ends = np.cumsum(length)
+        drawn = self.random.integers(ends[-1], size=n)
+        episode = np.searchsorted(ends, drawn, side="right")
+        step = drawn - (ends - length)[episode]
+        return self._cell(env[episode], first[episode] + step)
+
+    def _cell(self, env: np.ndarray, row: np.ndarray) -> np.ndarray:
+        return row % self.buffer_size * self.n_envs + env
 
     def _draw_goals(self, cells: np.ndarray) -> np.ndarray:
         """Draw a goal for each transition. Shapes: ``(batch, goal_size)``."""

@@ -37,9 +37,11 @@ def complete(cfg: RunConfig) -> RunConfig:
 def prepare_torch(cfg: RunConfig) -> None:
     """Set threads and seeds before anything draws a random number."""
     import torch
+    from threadpoolctl import threadpool_limits
 
     _check_device(cfg.device)
     torch.set_num_threads(cfg.n_threads)
+    threadpool_limits(cfg.n_threads, user_api="blas")  # of NumPy; stays until the next call
     seed_everything(cfg.seed)
 
 

@@ -104,7 +104,7 @@ class Profiling(RunCallback):
     def begin(self, trainer: Trainer) -> None:
         """Measure what the run calls."""
         measure, model = self.profile.measure, trainer.state.model
-        measure(ENVIRONMENT, model.get_env(), "step")
+        measure(ENVIRONMENT, model.get_env(), "step_wait")
         for env in getattr(model.get_env().unwrapped, "envs", []):
             measure(RENDERING, env, "render")
         for method in ("explore", "_sample_action"):  # ours and Stable-Baselines3's

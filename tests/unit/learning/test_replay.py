@@ -558,6 +558,16 @@ def test_episodes_that_moved_something_are_preferred(share: float, expected: flo
     assert preferred == pytest.approx(expected, abs=0.03)
 
 
+def test_episodes_that_were_dropped_are_not_preferred() -> None:
+    buffer = make(24, moved_share=1.0)
+    record(buffer, [5])  # moves, and is dropped by the fourth episode
+    for episode in (2, 3, 4):
+        for step in range(6):
+            place = still(episode, step), still(episode, step + 1)
+            buffer.add(*place, np.zeros((1, 2)), np.zeros(1), np.array([step == 5]), [{}])
+    assert buffer.sample_arrays(100).observations[:, 0].min() >= 200  # 100 episode + step
+
+
 def test_preferring_what_does_not_exist_draws_from_all() -> None:
     buffer = make(moved_share=1.0)
     for step in range(5):
