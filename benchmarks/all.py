@@ -41,6 +41,7 @@ BENCHMARKS = {
     "startup": Benchmark(("startup.py",), "--help and the first step", 2),
     "updates": Benchmark(("updates.py",), "updates per second beside the peers'", 6),
     "steps": Benchmark(("steps.py",), "steps per second beside the peers'", 8),
+    "rounds": Benchmark(("rounds.py",), "how well a round of jaxsac overlaps", 1),
     "replay": Benchmark(("replay.py",), "hindsight replay: speed and memory", 1),
     "checkpoint": Benchmark(("checkpoint_1m.py",), "saving a replay buffer of 1M", 1),
     "environments": Benchmark(("environments.py",), "our environments beside the originals", 1),

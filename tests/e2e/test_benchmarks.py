@@ -41,6 +41,13 @@ SMALLEST = {
         ["steps.py", "--rounds", "1", "--steps", "120", "--only", "stable-baselines3", "jaxsac"],
         "jaxsac",
     ),
+    "rounds": (
+        [
+            "rounds.py", "--rounds", "1", "--steps", "2", *SMALL_RUN[:2],
+            "algorithm.learning_starts=400",
+        ],
+        "ratio",
+    ),
     "replay": (["replay.py", "--transitions", "4000"], "ours"),
     "checkpoint": (["checkpoint_1m.py", "--transitions", "1000"], "save_seconds"),
     "environments": (["environments.py", "--steps", "1"], 0),
