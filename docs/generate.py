@@ -10,20 +10,19 @@ import importlib
 import inspect
 import io
 import itertools
-import json
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator
-from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import yaml
 
+from scilab_rl.acceptance.agents import CARD_FILE, card_page, read_card
 from scilab_rl.cli.main import COMMANDS, run_command_line
 from scilab_rl.cli.tables import as_typed
 from scilab_rl.config.schema import ALIASES, CONDITIONS, KEYS, Key
-from scilab_rl.config.workspace import SHIPPED_CONF, config_files
+from scilab_rl.config.workspace import SHIPPED_AGENTS, SHIPPED_CONF, config_files
 from scilab_rl.envs import catalog
 from scilab_rl.learning.declared import declared_metrics
 from scilab_rl.metrics import probes
@@ -55,7 +54,14 @@ API = {
         "scilab_rl.results.RunResult",
     ),
 }
-BASELINES = Path(__file__).parents[1] / "baselines"
+# Files of the repository, and where the site shows what they say.
+_ELSEWHERE = (
+    (
+        re.compile(r"\]\(\.\./src/scilab_rl/agents/(\w+)/README\.md\)"),
+        lambda match: f"](reference/agents.md#{match[1].lower()})",
+    ),
+    (re.compile(r"\]\(\.\./baselines/[^)]+\)"), "](environments.md#all-performance-tests)"),
+)
 _SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Shapes")
 _ITEM = re.compile(r"(\*{0,2}[\w, ]+?): (.*)")
 
@@ -71,8 +77,10 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Insert generated tables where a page has their mark; called by MkDocs."""
-    return markdown.replace("<!-- generated: learned -->", "\n".join(learned_table()))
+    """Let links to files outside of the site lead to their place in it; called by MkDocs."""
+    for file, place in _ELSEWHERE:
+        markdown = file.sub(place, markdown)
+    return markdown
 
 
 def keys_page() -> Iterator[str]:
@@ -219,28 +227,16 @@ def search_page() -> Iterator[str]:
         yield from fenced("yaml", path.read_text(encoding="utf-8"))
 
 
-def learned_table() -> Iterator[str]:
-    """Yield the results of all performance tests that have a baseline, by environment."""
-    rows = []
-    for path in BASELINES.glob("*/*.json"):
-        result = json.loads(path.read_text(encoding="utf-8"))
-        verdict, target = result["verdict"], result["definition"]["conditions"]
-        configuration = result["definition"]["configuration"]
-        steps = sorted(run["steps"] for run in result["runs"])
-        rows.append((
-            f"`{json.loads(configuration['env'])}`",
-            f"`{json.loads(configuration['algorithm.name'])}`",
-            target["eval_columns"].removeprefix("eval/").replace("_", " "),
-            f"{target['eval_value']:g} within {target['max_steps']:,} steps",
-            f"{verdict['mean']:.3g} [{verdict['low']:.3g}, {verdict['high']:.3g}]",
-            verdict["outcome"],
-            verdict["n_runs"],
-            f"{steps[0]:,} to {steps[-1]:,}",
-            f"`{result['name']}`",
-            result["date"],
-        ))  # fmt: skip
-    columns = ("environment", "algorithm", "metric", "target", "result", "outcome", "runs", "steps")
-    yield from table((*columns, "performance test", "date"), sorted(rows))
+def agents_page() -> Iterator[str]:
+    """Yield the cards of the shipped agents."""
+    yield "# Trained agents\n"
+    yield (
+        "They are in the package. Play, record, probe or compare them as `agent:NAME`, or start a "
+        "run from one with `restore_policy=agent:NAME`: [how](../howto/resume.md#trained-agents).\n"
+    )
+    for file in sorted(SHIPPED_AGENTS.glob(f"*/{CARD_FILE}")):
+        yield from (re.sub(r"^#", "##", line) for line in card_page(read_card(file.parent)))
+        yield ""
 
 
 def api_page() -> Iterator[str]:
@@ -349,6 +345,7 @@ PAGES: dict[str, Callable[[], Iterator[str]]] = {
     "commands": commands_page,
     "algorithms": algorithms_page,
     "environments": environments_page,
+    "agents": agents_page,
     "metrics": metrics_page,
     "search": search_page,
     "api": api_page,

@@ -106,6 +106,13 @@ def test_a_study_ends_with_its_report(core_alone: Path, tmp_path: Path) -> None:
     assert (tmp_path / "data/studies/mine/report.html").stat().st_size > 10_000
 
 
+def test_agents_play_or_name_the_extra_that_they_need(core_alone: Path, tmp_path: Path) -> None:
+    done = run(core_alone, tmp_path, "play", "agent:Reach1DOF", "--episodes", "2")
+    assert done.returncode == 0, done.stderr
+    done = run(core_alone, tmp_path, "play", "agent:FetchReach", "--episodes", "2")
+    assert done.returncode == 2 and 'pip install "scilab-rl[jax]"' in done.stderr
+
+
 @pytest.mark.slow
 def test_all_that_reports(core_alone: Path, tmp_path: Path) -> None:
     """Performance tests, films and recorded episodes, with the simulator of the core."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 from .commands import QUICK, ROOT, TINY, last_run, quiet_environment
@@ -25,14 +26,21 @@ def test_wheel_trains_in_an_empty_folder(tmp_path: Path) -> None:
     assert not (site / "custom_algorithms").exists(), "the project folder belongs to the researcher"
     assert (site / "scilab_rl" / "conf" / "main.yaml").is_file()
     assert (site / "scilab_rl" / "templates" / "style.css").is_file()
-    done = subprocess.run(
-        [sys.executable, "-m", "scilab_rl.cli.main", "algorithm=sac", TINY, *QUICK, "n_epochs=2"],
+    run = partial(
+        subprocess.run,
         cwd=project,
         env=quiet_environment(PYTHONPATH=str(site)),
         capture_output=True,
         text=True,
         check=False,
     )
+    program = [sys.executable, "-m", "scilab_rl.cli.main"]
+    done = run([*program, "algorithm=sac", TINY, *QUICK, "n_epochs=2"])
     assert done.returncode == 0, done.stderr
     assert "Warning" not in done.stderr
     assert (last_run(project) / "rl_model_finished" / "manifest.json").is_file()
+    agents = {p.relative_to(copy / "src") for p in (copy / "src/scilab_rl/agents").rglob("*.*")}
+    assert agents and [path for path in agents if not (site / path).exists()] == []
+    played = run([*program, "play", "agent:Reach1DOF", "--episodes", "2"])
+    assert played.returncode == 0, played.stderr
+    assert "success" in played.stdout

@@ -149,9 +149,10 @@ def measure(agent: RunDirectory, seeds: Sequence[int], n_episodes: int) -> dict[
     ends = _Ends()
     observed_layer(env).observers.append(ends)
     try:
-        shares = [
-            evaluate(model, env, n_episodes, derive_seed(seed, "card")).episodes for seed in seeds
-        ]
+        shares = []
+        for seed in seeds:
+            _log.info("Seed %d: %d episodes ...", seed, n_episodes)
+            shares.append(evaluate(model, env, n_episodes, derive_seed(seed, "card")).episodes)
         fingerprint = fingerprint_of(env.envs[0])  # type: ignore[attr-defined]
     finally:
         env.close()
@@ -280,6 +281,9 @@ def _failures_in_words(failures: Mapping[str, Any], n_episodes: int) -> Iterator
             f"The lowest return of {n_episodes:,} episodes was {failures['lowest_return']:.4g}; "
             f"5 % were at most {failures['return_of_the_worst_5_percent']:.4g}."
         )
+        return
+    if not failures["episodes"]:
+        yield f"None of {n_episodes:,} episodes failed."
         return
     yield (
         f"{failures['episodes']} of {n_episodes:,} episodes failed; "

@@ -26,6 +26,7 @@ LAST_LINK = "last"
 LOCK_FILE = ".lock"
 AGENT = "agent:"
 _POLICY = "rl_model_"
+_AGENT_OUTPUTS = "agents"  # below the folder of all runs
 # The C loader is ten times faster, and there may be thousands of runs.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -246,8 +247,7 @@ def find_run(name: str, base: Path) -> RunDirectory:
     Raises:
         ConfigError: If no run or more than one fits.
     """
-    known = [find_agent(name.removeprefix(AGENT))] if name.startswith(AGENT) else []
-    for path in (*known, Path(name), base / name):
+    for path in (*_named_agent(name, base), Path(name), base / name):
         for candidate in (path, path.parent):
             if (candidate / CONFIG_FILE).is_file():
                 return _opened(candidate.resolve(), base)
@@ -266,9 +266,18 @@ def find_run(name: str, base: Path) -> RunDirectory:
     )
 
 
+def _named_agent(name: str, base: Path) -> list[Path]:
+    """Return the agent that ``agent:NAME`` names, or the path of what was made of it."""
+    if name.startswith(AGENT):
+        return [find_agent(name.removeprefix(AGENT))]
+    path = Path(name).resolve()
+    is_output = path.parent == (base / _AGENT_OUTPUTS).resolve() and path.is_dir()
+    return [find_agent(path.name)] if is_output else []
+
+
 def _opened(path: Path, base: Path) -> RunDirectory:
     is_agent = path.parent in (SHIPPED_AGENTS, PROJECT_AGENTS.resolve())
-    return RunDirectory(path, base / "agents" / path.name if is_agent else None)
+    return RunDirectory(path, base / _AGENT_OUTPUTS / path.name if is_agent else None)
 
 
 def reports_success(run: RunDirectory) -> bool:

@@ -99,6 +99,7 @@ def test_it_is_found_played_and_compared_and_never_changed(agent, tmp_path, caps
     assert "success" in capsys.readouterr().out
     assert run_command_line(["export", "agent:Tiny", "--episodes", "2"]) == 0
     assert (tmp_path / "data" / "agents" / "Tiny" / "trials_step.csv").is_file()
+    assert str(find_run("data/agents/Tiny", Path("data"))) == "agent:Tiny"
     assert run_command_line(["compare", "agent:Tiny", "last"]) == 0
     assert files_of(agent) == before
 
