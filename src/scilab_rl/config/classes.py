@@ -90,10 +90,24 @@ def build(value: object, key: str, *, is_partial: bool = False) -> Any:
         raise ConfigError(f"{key}: {type(error).__name__}: {error}") from error
 
 
+def missing_package(error: BaseException | None, target: str) -> MissingDependencyError | None:
+    """Return the error about a package of an extra, if a class cannot be imported for that reason.
+
+    Args:
+        error: What the import has raised.
+        target: The name of the class.
+    """
+    while error is not None:
+        if isinstance(error, ImportError) and error.name in ("jax", "optax"):
+            purpose = f"for the compiled algorithms, such as {target.split('.')[-2]}"
+            return MissingDependencyError(error.name, "jax", purpose)
+        error = error.__cause__
+    return None
+
+
 def _explained(error: Exception, target: str, key: str) -> ConfigError:
-    if isinstance(error, ImportError) and error.name in ("jax", "optax"):
-        purpose = f"for the compiled algorithms, such as {target.split('.')[-2]}"
-        return MissingDependencyError(error.name, "jax", purpose)
+    if (missing := missing_package(error, target)) is not None:
+        return missing
     kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
     return ConfigError(
         f"{key}: '{target}' cannot be imported: {kind}{error}. The class in "

@@ -15,7 +15,7 @@ from hydra.errors import OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from scilab_rl.config.classes import class_name
+from scilab_rl.config.classes import class_name, missing_package
 from scilab_rl.config.compose import explain_error, friendly_override, to_plain
 from scilab_rl.config.overrides import read_changes
 from scilab_rl.config.schema import RunConfig, Values
@@ -111,7 +111,8 @@ def _refuse_untrusted_class(target: str, path: Path) -> None:
         try:
             found = hydra.utils.get_class(target)
         except Exception as error:
-            raise ConfigError(f"'{path}' names '{target}', which cannot be found.") from error
+            unknown = ConfigError(f"'{path}' names '{target}', which cannot be found.")
+            raise (missing_package(error, target) or unknown) from error
         if found.__module__.startswith(_TRUSTED):
             return
     raise ConfigError(
