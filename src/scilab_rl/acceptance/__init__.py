@@ -1,1 +1,1 @@
-"""Performance tests: acceptance rules with declared error rates, and baselines."""
+"""Performance tests: acceptance rules with declared error rates, baselines, and trained agents."""
