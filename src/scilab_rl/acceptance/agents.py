@@ -104,7 +104,7 @@ def write_agent(
             about={"epoch": saved.get("epoch")},
         )  # fmt: skip
         _write_history(run, unfinished)
-        card = _card(run, unfinished, name, policy, n_episodes, licence)
+        card = _card(run, unfinished, name, policy, saved["step"], n_episodes, licence)
         files.write_json(unfinished / CARD_FILE, card)
         files.write_text(unfinished / PAGE_FILE, "\n".join(card_page(card)) + "\n")
         if target.exists():
@@ -183,7 +183,13 @@ def measure(agent: RunDirectory, seeds: Sequence[int], n_episodes: int) -> dict[
 
 
 def _card(
-    run: RunDirectory, agent: Path, name: str, policy: Path, n_episodes: int, licence: str
+    run: RunDirectory,
+    agent: Path,
+    name: str,
+    policy: Path,
+    step: int,
+    n_episodes: int,
+    licence: str,
 ) -> dict[str, Any]:
     cfg = load_recorded(agent / CONFIG_FILE)
     measured = measure(RunDirectory(agent), SEEDS, n_episodes // len(SEEDS))
@@ -207,8 +213,8 @@ def _card(
             "seed": cfg.seed,
             "started_from_another_policy": load_recorded(run / CONFIG_FILE).restore_policy
             is not None,
-            "steps": epochs[-1]["step"],
-            "minutes": round(_seconds(epochs) / 60, 1),
+            "steps": step,
+            "minutes": round(_seconds([row for row in epochs if row["step"] <= step]) / 60, 1),
             "status": result.status if result is not None else "unknown",
             "machine": source.get("machine") or _processor_of(source),
             "git_commit": source.get("git_commit"),
@@ -244,8 +250,8 @@ def card_page(card: Mapping[str, Any]) -> Iterator[str]:
             "measured in",
             f"{evaluation['episodes']:,} new episodes, seeds {seeds}; most likely actions",
         ),
-        ("steps of training", f"{training['steps']:,}, seed {training['seed']}"),
-        ("minutes", f"{training['minutes']:g}, with evaluations"),
+        ("steps of training", f"{training['steps']:,} until this policy, seed {training['seed']}"),
+        ("minutes", f"{training['minutes']:g} until this policy, with evaluations"),
         ("machine", _in_words(training["machine"])),
         ("policy", f"{card['policy']}, {card['bytes'] / 1e6:.2f} MB"),
         ("fingerprint", f"`{card['fingerprint']}` of the environment"),
