@@ -51,7 +51,7 @@ def test_leaves_a_whole_report(finished: Path) -> None:
     study = study_of(finished, "mine")
     page = (study / "report.html").read_text()
     assert "data:image/png;base64," in page
-    assert "http" not in page
+    assert "://" not in page  # pictures may contain any letters
     assert (study / "configurations.csv").read_text().startswith("configuration,algorithm.gamma")
     runs = runs_of(study)
     assert [run.state for run in runs] == ["complete"] * 6

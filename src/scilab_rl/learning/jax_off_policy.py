@@ -195,9 +195,10 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
     def while_stepping(self) -> None:
         """Draw the transitions of the next round, in which the present steps cannot be yet.
 
-        The first round is drawn after its steps, since an episode must have ended by then.
+        The first round is drawn after its steps, since an episode need not have ended before.
         """
-        if self.overlap and self._batch is None and self.rounds.n_started:
+        is_due = self.num_timesteps > self.learning_starts  # already before these steps
+        if self.overlap and self._batch is None and is_due:
             self._batch = self.draw(self.updates_per_round)
 
     def train(self, gradient_steps: int) -> None:

@@ -186,14 +186,22 @@ def test_as_many_updates_as_steps(make: Any) -> None:
 
 
 def test_overlap_only_delays_the_acting_policy(make: Any) -> None:
-    overlapping, waiting = make(), make(overlap=False)
-    for model in (overlapping, waiting):
-        model.learn(41)  # one round, started with the same weights and transitions
+    overlapping = make()
+    overlapping.learn(41)  # one round
+    waiting = make(overlap=False)
+    waiting.learn(41)  # one round, started with the same weights and transitions
     trained = waiting.rounds.networks["actor"][0]["weight"]
     untrained = overlapping.rounds.networks["actor"][0]["weight"]
     assert (trained != untrained).any()
     overlapping.finish_round()
     np.testing.assert_array_equal(trained, overlapping.rounds.networks["actor"][0]["weight"])
+
+
+def test_restored_policy_waits_for_an_episode_as_well(make: Any) -> None:
+    model = make()
+    model.rounds.n_started = 100  # as after loading
+    model.learn(41)  # ended none when its first steps are taken
+    assert model.rounds.n_started == 101
 
 
 def test_metrics_and_answers(make: Any) -> None:
