@@ -165,7 +165,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
         # first row, the running episode's first row, and the row where it is now.
         self._cursors = np.zeros((3, n_envs), np.int64)
         # Of each ended episode in which the achieved goal moved: environment, first row, length.
-        self._moved = np.zeros((0, 3), np.int64)
+        # Like the cursors it has fewer rows than the ring, so that a checkpoint keeps all of it.
+        self._moved = np.zeros((3, 0), np.int64)
         self._judge_by(env)
 
     def __getstate__(self) -> dict[str, object]:
@@ -182,7 +183,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
         """Forget everything."""
         super().reset()
         self._cursors[:] = 0
-        self._moved = self._moved[:0]
+        self._moved = self._moved[:, :0]
 
     def add(  # type: ignore[override]
         self,
@@ -325,7 +326,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
             self.steps_left[rows, index] = np.arange(length, -1, -1)
             reached = self.rows[rows, index, self._columns["achieved_goal"]]
             if np.ptp(reached, axis=0).max() > _REST:
-                self._moved = np.vstack([self._moved, [index, start[index], length]])
+                episode = [[index], [start[index]], [length]]
+                self._moved = np.hstack([self._moved, episode])
             now[index] += 1
             start[index] = now[index]
 
@@ -343,8 +345,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
                     oldest[index] += 1
                     start[index] += 1
         if dropped:
-            env, first, _ = self._moved.T
-            self._moved = self._moved[first >= oldest[env]]
+            env, first, _ = self._moved
+            self._moved = self._moved[:, first >= oldest[env]]
 
     def _relabel(self, batch: Transitions, chosen: np.ndarray, cells: np.ndarray) -> None:
         """Put other goals into the chosen transitions, which come from these cells."""
@@ -392,7 +394,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
             )
         cells = np.empty(n, np.int64)
         from_moved = np.zeros(n, bool)
-        if self.moved_share and len(self._moved):
+        if self.moved_share and self._moved.size:
             from_moved = self.random.random(n) < self.moved_share
             cells[from_moved] = self._draw_moved_cells(int(from_moved.sum()))
         (missing,) = (~from_moved).nonzero()
@@ -406,7 +408,7 @@ class HindsightReplayBuffer(HerReplayBuffer):
 
     def _draw_moved_cells(self, n: int) -> np.ndarray:
         """Draw transitions of episodes in which the achieved goal moved. Shapes: ``(n,)``."""
-        env, first, length = self._moved.T
+        env, first, length = self._moved
         ends = np.cumsum(length)
         drawn = self.random.integers(ends[-1], size=n)
         episode = np.searchsorted(ends, drawn, side="right")

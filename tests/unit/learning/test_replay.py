@@ -566,6 +566,7 @@ def test_episodes_that_were_dropped_are_not_preferred() -> None:
             place = still(episode, step), still(episode, step + 1)
             buffer.add(*place, np.zeros((1, 2)), np.zeros(1), np.array([step == 5]), [{}])
     assert buffer.sample_arrays(100).observations[:, 0].min() >= 200  # 100 episode + step
+    assert buffer._moved.size == 0
 
 
 def test_preferring_what_does_not_exist_draws_from_all() -> None:
