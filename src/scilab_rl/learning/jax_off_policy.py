@@ -148,7 +148,8 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
             self.n_observations, active=normalize_observations, n_flags=self.relay is not None
         )
         self.reward_bounds = np.array([np.inf, -np.inf])
-        self._batch: Batch | None = None  # of the next round
+        # Gives the next round's transitions; a function, so that no policy is saved with them.
+        self._drawn: Callable[[], Batch] | None = None
         self._jax_device = device
 
     def start_learning(
@@ -180,7 +181,8 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
     def iterate(self, callback: BaseCallback) -> bool:
         """Collect steps while the last round of updates computes, then start the next round."""
         is_collected = self.collect(callback)
-        batch, self._batch = self._batch, None  # which nothing that is saved contains
+        batch = None if self._drawn is None else self._drawn()
+        self._drawn = None
         if not is_collected:
             return False
         if batch is None and self.num_timesteps > self.learning_starts:
@@ -198,8 +200,9 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
         The first round is drawn after its steps, since an episode need not have ended before.
         """
         is_due = self.num_timesteps > self.learning_starts  # already before these steps
-        if self.overlap and self._batch is None and is_due:
-            self._batch = self.draw(self.updates_per_round)
+        if self.overlap and self._drawn is None and is_due:
+            batch = self.draw(self.updates_per_round)
+            self._drawn = lambda: batch
 
     def train(self, gradient_steps: int) -> None:
         """Do a round of updates, and wait for it."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,7 @@ from scilab_rl.algorithms.jaxsac import JAXSAC, Settings  # noqa: E402
 from scilab_rl.learning.jax_engine import Batch, dense_layers  # noqa: E402
 from scilab_rl.learning.replay import HindsightReplayBuffer  # noqa: E402
 from scilab_rl.metrics.logger import MetricLogger  # noqa: E402
+from scilab_rl.training.policy import load_policy, save_policy  # noqa: E402
 
 N_OBSERVATIONS, N_ACTIONS, BATCH = 5, 2, 8
 
@@ -202,6 +204,19 @@ def test_restored_policy_waits_for_an_episode_as_well(make: Any) -> None:
     model.rounds.n_started = 100  # as after loading
     model.learn(41)  # ended none when its first steps are taken
     assert model.rounds.n_started == 101
+
+
+def test_policy_that_is_saved_within_a_step_loads(make: Any, tmp_path: Path) -> None:
+    model = make()
+
+    def save(_locals: dict[str, Any], _globals: dict[str, Any]) -> bool:
+        save_policy(model, tmp_path / "policy", 1)
+        return model.num_timesteps < 50
+
+    model.learn(60, callback=save)
+    loaded = make()
+    load_policy(loaded, tmp_path / "policy")
+    assert loaded.num_timesteps == 50
 
 
 def test_metrics_and_answers(make: Any) -> None:
