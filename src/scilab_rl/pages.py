@@ -8,7 +8,9 @@ from __future__ import annotations
 import base64
 import functools
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
+
+from scilab_rl import charts
 
 if TYPE_CHECKING:
     from jinja2 import Environment
@@ -17,6 +19,18 @@ if TYPE_CHECKING:
 _STATES = (
     "pass", "better", "winner", "fail", "failed", "error", "worse", "inconclusive", "undecided",
 )  # fmt: skip
+
+
+class Link(NamedTuple):
+    """A cell of a table that leads somewhere.
+
+    Attributes:
+        text: What is written.
+        address: Where it leads, relative to the page.
+    """
+
+    text: str
+    address: str
 
 
 def render(template: str, **content: object) -> str:
@@ -37,6 +51,8 @@ def as_cell(value: object) -> str:
     """
     if value is None:
         return "-"
+    if isinstance(value, Link):
+        return value.text
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
@@ -61,6 +77,6 @@ def _environment() -> Environment:
         autoescape=True, undefined=StrictUndefined, trim_blocks=True, keep_trailing_newline=True,
     )  # fmt: skip
     environment.filters |= {"as_cell": as_cell, "data_address": data_address}
-    environment.globals["STATES"] = _STATES
+    environment.globals |= {"STATES": _STATES, "charts": charts}
     environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
     return environment
