@@ -1,4 +1,4 @@
-"""Draw docs/images/environments.png: one frame of each environment, after some random steps.
+"""Draw docs/images/environments.png and choices.png: a frame of each task after some random steps.
 
 MyoSuite's frame is drawn by .venv-myosuite, where `make test-myosuite` has made it. CoppeliaSim is
 not there: its frames come from the real simulator, and the tests' stand-in draws dots.
@@ -25,7 +25,7 @@ from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs.fingerprint import scripted_action
 from scilab_rl.envs.vectorize import make_single_env
 
-TARGET = Path(__file__).parent / "images" / "environments.png"
+IMAGES = Path(__file__).parent / "images"
 MYOSUITE_PYTHON = Path(__file__).parents[1] / ".venv-myosuite" / "bin" / "python"
 N_STEPS, N_COLUMNS = 8, 5
 CAPTION = (
@@ -46,6 +46,13 @@ ENVIRONMENTS = [
     "PointGym-sparse-0.5-medium_custom_dgr-c1-rt0-s500-v0",
     "PointObjGym-sparse-o4-0.5-small_open_dgr-c1-rt0-s300-v0",
     "AntGym-sparse-10-1.5-small_open_dgr-c1-rt0-s500-v0",
+]
+CHOICES = [
+    "Bandit-drifting-a4-v0",
+    "ProbabilisticReversal-v0",
+    "TwoStep-v0",
+    "Horizon-v0",
+    "HiddenGoal-v0",
 ]
 SUITES = {
     "highway_env": ["parking-limited-v0"],
@@ -75,16 +82,8 @@ def frame_by_myosuite(env_id: str) -> np.ndarray:
         return np.load(file.name)
 
 
-def main() -> None:
-    """Draw the sheet, or, with an id and a file, save this one frame."""
-    if len(sys.argv) == 3:
-        np.save(sys.argv[2], frame_of(sys.argv[1]))
-        return
-    installed = [ids for package, ids in SUITES.items() if importlib.util.find_spec(package)]
-    env_ids = [*ENVIRONMENTS, *(env_id for ids in installed for env_id in ids)]
-    frames = {env_id: frame_of(env_id) for env_id in env_ids}
-    if MYOSUITE_PYTHON.exists():
-        frames |= {env_id: frame_by_myosuite(env_id) for env_id in MYOSUITE}
+def draw_sheet(frames: dict[str, np.ndarray], target: Path, caption: str = "") -> None:
+    """Draw frames in rows, each with its id above it."""
     n_rows = -(-len(frames) // N_COLUMNS)
     figure, axes = plt.subplots(n_rows, N_COLUMNS, figsize=(3 * N_COLUMNS, 3.3 * n_rows))
     for axis in axes.flat:
@@ -93,8 +92,22 @@ def main() -> None:
         axis.imshow(frame)
         axis.set_title(env_id, fontsize=7 if len(env_id) < 40 else 5)
     figure.tight_layout(rect=(0, 0.02, 1, 1))
-    figure.text(0.01, 0.006, CAPTION, fontsize=8)
-    figure.savefig(TARGET, dpi=80)
+    figure.text(0.01, 0.006, caption, fontsize=8)
+    figure.savefig(target, dpi=80, bbox_inches="tight" if n_rows == 1 else None)
+
+
+def main() -> None:
+    """Draw the sheets, or, with an id and a file, save this one frame."""
+    if len(sys.argv) == 3:
+        np.save(sys.argv[2], frame_of(sys.argv[1]))
+        return
+    draw_sheet({env_id: frame_of(env_id) for env_id in CHOICES}, IMAGES / "choices.png")
+    installed = [ids for package, ids in SUITES.items() if importlib.util.find_spec(package)]
+    env_ids = [*ENVIRONMENTS, *(env_id for ids in installed for env_id in ids)]
+    frames = {env_id: frame_of(env_id) for env_id in env_ids}
+    if MYOSUITE_PYTHON.exists():
+        frames |= {env_id: frame_by_myosuite(env_id) for env_id in MYOSUITE}
+    draw_sheet(frames, IMAGES / "environments.png", CAPTION)
 
 
 if __name__ == "__main__":

@@ -23,7 +23,8 @@ VARIANTS = (
 )
 # The ant is slow, and CoppeliaSim needs a simulator: they have classes of their own.
 ELSEWHERE = ("AntGym-v0", "CoppeliaReach-v0", "CoppeliaDrive-v0")
-SHIPPED = [family.env_id for family in FAMILIES if family.env_id not in ELSEWHERE]
+CHOICES = [family.env_id for family in FAMILIES if ".choices." in family.entry_point]
+SHIPPED = [family.env_id for family in FAMILIES if family.env_id not in (*ELSEWHERE, *CHOICES)]
 FETCH = ["FetchReach-v4", "FetchPush-v4", "FetchPickAndPlace-v4", "FetchSlide-v4"]
 
 
@@ -38,6 +39,19 @@ def shipped(request):
 @pytest.mark.usefixtures("shipped")
 class TestShipped(EnvironmentContract):
     n_steps = 300
+
+    def test_fingerprint_is_recorded(self) -> None:
+        assert fingerprint.known(self.env)
+
+
+@pytest.fixture(params=CHOICES)
+def choice_task(request):
+    request.instance.env = request.param
+
+
+@pytest.mark.usefixtures("choice_task")
+class TestChoiceTasks(EnvironmentContract):
+    n_steps = 450  # more than the longest block
 
     def test_fingerprint_is_recorded(self) -> None:
         assert fingerprint.known(self.env)

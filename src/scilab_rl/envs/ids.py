@@ -26,7 +26,7 @@ class Family:
     Attributes:
         env_id: The registered id.
         entry_point: ``module:Class``.
-        max_episode_steps: Step limit of the registered id.
+        max_episode_steps: Step limit of the registered id; None where the task itself ends.
         grammar: What the names of its variants look like, for people.
         pattern: The same as a regular expression; its groups are keyword arguments.
         read: Turns the groups into keyword arguments and, under ``max_episode_steps``, the limit.
@@ -34,7 +34,7 @@ class Family:
 
     env_id: str
     entry_point: str
-    max_episode_steps: int
+    max_episode_steps: int | None
     grammar: str = ""
     pattern: str = "(?!)"
     read: Callable[[Mapping[str, str]], Arguments] = field(default=lambda groups: {})
@@ -82,6 +82,10 @@ def _read_maze(groups: Mapping[str, str]) -> Arguments:
         **whole,
         "max_episode_steps": int(groups["max_episode_steps"]),
     }
+
+
+def _read_bandit(groups: Mapping[str, str]) -> Arguments:
+    return {"schedule": groups["schedule"], "n_arms": int(groups["n_arms"])}
 
 
 _MAPS = ("open", "open_dg", "open_dgr", "small_open_dg", "small_open_dgr", "medium_custom_dgr")
@@ -147,6 +151,18 @@ FAMILIES = (
         rf"AntGym{_REWARD}-(?P<frame_skip>[1-9]\d*){_PLACE}",
         _read_maze,
     ),
+    Family(
+        "Bandit-v0",
+        "scilab_rl.envs.choices.bandit:Bandit",
+        None,
+        "Bandit-{static,reversal,drifting}-a{2..10}-v0",
+        r"Bandit-(?P<schedule>static|reversal|drifting)-a(?P<n_arms>[2-9]|10)",
+        _read_bandit,
+    ),
+    Family("ProbabilisticReversal-v0", "scilab_rl.envs.choices.bandit:ProbabilisticReversal", None),
+    Family("TwoStep-v0", "scilab_rl.envs.choices.two_step:TwoStep", None),
+    Family("Horizon-v0", "scilab_rl.envs.choices.horizon:Horizon", None),
+    Family("HiddenGoal-v0", "scilab_rl.envs.choices.hidden_goal:HiddenGoal", None),
 )
 
 
@@ -191,4 +207,5 @@ def _register(family: Family, env_id: str, arguments: Arguments) -> str:
     if env_id not in gym.registry:
         gym.register(env_id, family.entry_point, max_episode_steps=limit, kwargs=arguments)
     meaning = ", ".join(f"{key}={value}" for key, value in arguments.items())
-    return f"{env_id} is {family.env_id} with {meaning}, {limit} steps."
+    steps = "" if limit is None else f", {limit} steps"
+    return f"{env_id} is {family.env_id} with {meaning}{steps}."

@@ -46,7 +46,11 @@ class Suite:
 
 
 SUITES = (
-    Suite("scilab_rl", "reaching, stacking, tools, buttons, mazes", modules=("scilab_rl.envs.",)),
+    Suite(
+        "scilab_rl",
+        "reaching, stacking, tools, buttons, mazes, choices",
+        modules=("scilab_rl.envs.",),
+    ),
     Suite(
         "gymnasium",
         "classic control, toy texts, MuJoCo's walkers",
