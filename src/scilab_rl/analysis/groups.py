@@ -12,7 +12,9 @@ from pathlib import Path
 from scilab_rl.config.schema import learning_config
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.results import PRUNED, SOLVED
+from scilab_rl.run.annotations import read_annotations
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, all_runs, find_run, read_epochs
+from scilab_rl.run.facts import all_tags
 from scilab_rl.search.folders import STUDIES, study_names
 
 FAILED, UNFINISHED = "failed", ("running", "interrupted")
@@ -37,7 +39,7 @@ class RunRecord:
         seconds: Wall time.
         config: The part of its configuration that affects learning, see `learning_config`.
         group: The value of its key ``group``.
-        tags: Its tags.
+        tags: Its tags, of its configuration and given later.
     """
 
     path: Path
@@ -153,7 +155,7 @@ def read_record(run: RunDirectory) -> RunRecord | None:
         seconds=result.seconds if result is not None else 0.0,
         config=learning_config(config),
         group=config.get("group"),
-        tags=tuple(config.get("tags") or ()),
+        tags=tuple(all_tags(config, read_annotations(run).tags)),
     )
 
 

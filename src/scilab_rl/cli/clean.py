@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from scilab_rl.cli.parser import CommandParser
-from scilab_rl.cli.runs import CRASHED, DAMAGED, read_run
 from scilab_rl.cli.tables import print_rows
 from scilab_rl.errors import ConfigError
-from scilab_rl.run.directory import LOCK_FILE, RunDirectory
+from scilab_rl.run.directory import CONFIG_FILE, LOCK_FILE, RunDirectory
+from scilab_rl.run.facts import CRASHED, DAMAGED, read_run
 
 _log = logging.getLogger(__name__)
 _COLUMNS = ("kind", "size", "path")
@@ -54,7 +54,9 @@ def leftovers(base: Path) -> Iterator[tuple[Path, str]]:
     Args:
         base: The folder of all runs.
     """
-    for path in sorted(base.glob(f"*/*/{LOCK_FILE}")):
+    for path in sorted(base.glob(f"*/.*.tmp/{CONFIG_FILE}")):
+        yield path.parent, "half removed run"
+    for path in sorted(base.glob(f"*/[!.]*/{LOCK_FILE}")):
         run = RunDirectory(path.parent)
         if path.parent.is_symlink() or path.parent.parent.is_symlink() or run.is_in_use():
             continue

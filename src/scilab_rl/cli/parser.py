@@ -32,7 +32,7 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(prog=f"scilab-rl {command}", description=description, allow_abbrev=False)
         if run:
             self.add_argument(
-                "run", help="'last', agent:NAME, the path of a run, or a part of its name"
+                "run", help="'last', a run's id or path, a part of its name, or agent:NAME"
             )
         if base:
             self.add_argument(

@@ -2,108 +2,81 @@
 
 from __future__ import annotations
 
+import argparse
 import datetime as dt
 import itertools
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
 from pathlib import Path
 
 from scilab_rl.cli.parser import CommandParser, positive
-from scilab_rl.cli.tables import print_json, print_rows
-from scilab_rl.errors import ConfigError
-from scilab_rl.results import PRUNED, SOLVED
-from scilab_rl.run.directory import RESULT_FILE, RunDirectory, all_runs, read_epochs
+from scilab_rl.cli.tables import Row, is_terminal, print_json, print_rows
+from scilab_rl.run.directory import RunDirectory, all_runs
+from scilab_rl.run.facts import STATUSES, read_run
 from scilab_rl.run.provenance import fingerprint_differences
+from scilab_rl.search.folders import study_names
 
 _log = logging.getLogger(__name__)
 
-DAMAGED = "damaged"
-CRASHED = "crashed"  # recorded as running, but its process is gone
-STATUSES = ("running", CRASHED, "finished", SOLVED, PRUNED, "interrupted", "failed", DAMAGED)
 _COLUMNS = (
-    "run", "env", "algorithm", "seed", "status", "success", "reward", "epochs", "steps", "time",
-    "problem",
+    "id", "started", "env", "algorithm", "intrinsic", "changed", "seed", "status", "success",
+    "reward", "epochs", "steps", "time", "note", "tags", "problem",
 )  # fmt: skip
-# The name of a run contains these.
-_OPTIONAL = ("problem", "seed", "algorithm", "env", "epochs", "reward")
+_OPTIONAL = (
+    "steps", "started", "time", "epochs", "problem", "reward", "tags", "seed", "note",
+)  # fmt: skip
+_IF_ANY = ("intrinsic", "changed", "note", "tags", "problem")
+_PROSE = ("changed", "note", "tags")
+STUDY = "study"
 
 
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
-    parser = CommandParser(
-        "runs", "List the recorded runs, the oldest first.", base=True, json=True
-    )
-    parser.add_argument("--env", help="only this environment; * stands for any text")
-    parser.add_argument("--algorithm", help="only this algorithm; * stands for any text")
-    parser.add_argument("--status", choices=STATUSES, help="only runs of this status")
-    parser.add_argument("--last", type=positive, metavar="N", help="only the newest N")
-    options = parser.parse_args(arguments)
-
+    options = _parse(arguments)
+    studies = study_names(options.base_logdir)
     matching = (
         record
-        for record in map(read_run, reversed(list(all_runs(options.base_logdir))))
-        if _matches(record["env"], options.env)
-        and _matches(record["algorithm"], options.algorithm)
-        and options.status in (None, record["status"])
+        for run in reversed(list(all_runs(options.base_logdir)))
+        if _matches_options(record := read_run(run, studies), options)
     )
-    records = list(itertools.islice(matching, options.last))[::-1]
+    records = list(matching if studies else itertools.islice(matching, options.last))[::-1]
+    folds = not (options.json or options.unfold or options.study)
+    rows = (list(fold_studies(records)) if folds else records)[-(options.last or 0) :]
     for line in fingerprint_differences(RunDirectory(Path(str(r["path"]))) for r in records):
         _log.warning(line)
     if options.json:
-        print_json(records)
-    elif records:
-        rows = [{**record, "time": as_clock(record["seconds"])} for record in records]
-        print_rows(_COLUMNS, rows, optional=_OPTIONAL, if_any=("problem",))
+        print_json(rows)
+    elif rows:
+        shown = [{**row, "time": as_clock(row.get("seconds"))} for row in rows]
+        columns = _COLUMNS if is_terminal() else ("run", *_COLUMNS)
+        print_rows(columns, shown, optional=_OPTIONAL, if_any=_IF_ANY, prose=_PROSE)
     else:
         _log.info("No such runs in '%s'. Each training creates one.", options.base_logdir)
     return 0
 
 
-def read_run(run: RunDirectory) -> dict[str, object]:
-    """Return the facts about a run; damaged files make its status ``damaged``.
+def fold_studies(records: Iterable[Row]) -> Iterator[Row]:
+    """Yield the runs, and for each study one row with its best run, where its newest one would be.
 
     Args:
-        run: The directory of the run.
-
-    Returns:
-        The run's name, environment, algorithm, seed and status, the last values of success and
-        reward, the epochs, steps and seconds of training, its path, and the problem, if any.
+        records: Facts about runs, the oldest first.
     """
-    config, problem = {}, None
-    try:
-        config = run.read_config()
-    except ConfigError as error:
-        problem = str(error)
-    algorithm = config.get("algorithm")
-    record: dict[str, object] = {
-        "run": run.path.name,
-        "env": config.get("env"),
-        "algorithm": algorithm.get("name") if isinstance(algorithm, dict) else None,
-        "seed": config.get("seed"),
-        "status": DAMAGED,
-    }
-    result = run.read_result()
-    if result is None:
-        problem = problem or f"{RESULT_FILE} is missing or damaged"
-    else:
-        problem = problem or result.error
-        record["status"] = result.status if config else DAMAGED
-        if record["status"] == "running" and not run.is_in_use():
-            record["status"] = CRASHED
-    values: Mapping[str, object] = result.metrics if result is not None else {}
-    if not isinstance(values, dict) or not values:
-        values = _last_epoch(run)  # of a run that is still training
-    return record | {
-        "success": values.get("eval/success_rate"),
-        "reward": values.get("eval/mean_reward"),
-        "epochs": (result and result.epochs) or values.get("epoch"),
-        "steps": (result and result.steps) or values.get("step"),
-        "seconds": (result and result.seconds) or None,
-        "problem": problem,
-        "path": str(run),
-    }
+    rows = list(records)
+    newest = {row[STUDY]: row for row in rows if row[STUDY] is not None}
+    for row in rows:
+        name = row[STUDY]
+        if name is None:
+            yield row
+        elif row is newest[name]:
+            of_study = [one for one in rows if one[STUDY] == name]
+            best = max(of_study, key=lambda one: (_number(one["success"]), _number(one["reward"])))
+            kept = ("started", "env", "algorithm", "intrinsic", "success", "reward", STUDY)
+            yield {
+                **{key: best[key] for key in kept},
+                "run": name, "id": STUDY, "changed": name, "status": f"{len(of_study)} runs",
+            }  # fmt: skip
 
 
 def as_clock(seconds: object) -> str | None:
@@ -115,11 +88,20 @@ def as_clock(seconds: object) -> str | None:
     return str(dt.timedelta(seconds=int(seconds))) if isinstance(seconds, (int, float)) else None
 
 
-def _last_epoch(run: RunDirectory) -> dict[str, object]:
-    try:
-        return (read_epochs(run) or [{}])[-1]
-    except (OSError, ValueError):  # not the text that a run writes
-        return {}
+def _number(value: object) -> float:
+    return value if isinstance(value, (int, float)) else float("-inf")
+
+
+def _matches_options(record: Row, options: argparse.Namespace) -> bool:
+    tags = record["tags"]
+    assert isinstance(tags, list)
+    return (
+        _matches(record["env"], options.env)
+        and _matches(record["algorithm"], options.algorithm)
+        and options.status in (None, record["status"])
+        and options.study in (None, record[STUDY])
+        and (options.tag is None or options.tag in tags)
+    )
 
 
 def _matches(value: object, pattern: str | None) -> bool:
@@ -128,3 +110,18 @@ def _matches(value: object, pattern: str | None) -> bool:
         return True
     names = (str(value), re.sub(r"-v\d+$", "", str(value)))
     return any(fnmatchcase(name.lower(), pattern.lower()) for name in names)
+
+
+def _parse(arguments: list[str]) -> argparse.Namespace:
+    parser = CommandParser(
+        "runs", "List the recorded runs, the oldest first.", base=True, json=True
+    )
+    add = parser.add_argument
+    add("--env", help="only this environment; * stands for any text")
+    add("--algorithm", help="only this algorithm; * stands for any text")
+    add("--status", choices=STATUSES, help="only runs of this status")
+    add("--tag", help="only runs with this tag")
+    add("--study", metavar="NAME", help="only the runs of this study, one per line")
+    add("--unfold", action="store_true", help="a line for each run of a study, not for the study")
+    add("--last", type=positive, metavar="N", help="only the newest N")
+    return parser.parse_args(arguments)

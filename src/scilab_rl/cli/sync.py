@@ -113,7 +113,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         "sync", "Send ended runs to a tracker that was unavailable while they trained.", base=True
     )
     add = parser.add_argument
-    add("run", help="'last', the path of a run, a part of its name, or 'all'")
+    add("run", help="'last', a run's id or path, a part of its name, or 'all'")
     add("--to", choices=("mlflow", "tensorboard", "wandb"), default="mlflow",
         help="default: mlflow; for wandb, its own command is printed")  # fmt: skip
     add("--uri", help="address of an MLflow server; default: the run's own, or the local database")

@@ -10,7 +10,7 @@ from collections.abc import Mapping, Sequence
 Row = Mapping[str, object]
 
 # Longer cells are folded into several lines before a column is dropped.
-_FOLD_WIDTH = 18
+_FOLD_WIDTH, _PROSE_WIDTH = 18, 12
 _GAP = 2
 _STYLES = {
     "ok": "green",
@@ -23,6 +23,7 @@ _STYLES = {
     "fail": "red",
     "failed": "red",
     "damaged": "red",
+    "crashed": "red",
 }
 
 
@@ -32,6 +33,7 @@ def print_rows(
     *,
     optional: Sequence[str] = (),
     if_any: Sequence[str] = (),
+    prose: Sequence[str] = (),
     as_json: bool = False,
 ) -> None:
     """Print one line per row.
@@ -45,6 +47,7 @@ def print_rows(
         rows: The rows; a missing value and None are shown as ``-``.
         optional: Columns that a narrow terminal may drop, the least important first.
         if_any: Columns that are dropped if no row has a value.
+        prose: Columns that stay readable in 12 columns of the terminal.
         as_json: Whether to print the rows as JSON instead, with all their keys.
     """
     if as_json:
@@ -53,7 +56,7 @@ def print_rows(
     columns = [c for c in columns if c not in if_any or any(row.get(c) for row in rows)]
     cells = [{name: _cell(row.get(name)) for name in columns} for row in rows]
     if is_terminal():
-        _draw(columns, cells, optional)
+        _draw(columns, cells, optional, prose)
     else:
         write("\t".join(columns))
         for row in cells:
@@ -105,14 +108,17 @@ def _cell(value: object) -> str:
 
 
 def _draw(
-    columns: Sequence[str], cells: Sequence[Mapping[str, str]], optional: Sequence[str]
+    columns: Sequence[str],
+    cells: Sequence[Mapping[str, str]],
+    optional: Sequence[str],
+    prose: Sequence[str],
 ) -> None:
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     console = Console()
-    shown = _fitting(columns, cells, optional, console.width)
+    shown = _fitting(columns, cells, optional, prose, console.width)
     if shown is None:
         for row in cells:
             write("\n".join(f"{name}: {text}" for name, text in row.items()) + "\n")
@@ -128,11 +134,18 @@ def _draw(
 
 
 def _fitting(
-    columns: Sequence[str], cells: Sequence[Mapping[str, str]], optional: Sequence[str], width: int
+    columns: Sequence[str],
+    cells: Sequence[Mapping[str, str]],
+    optional: Sequence[str],
+    prose: Sequence[str],
+    width: int,
 ) -> list[str] | None:
     """Return the columns that fit, or None if even the required ones do not."""
     needed = {
-        name: min(_FOLD_WIDTH, max(len(name), *(len(row[name]) for row in cells), 1))
+        name: min(
+            _PROSE_WIDTH if name in prose else _FOLD_WIDTH,
+            max(len(name), *(len(row[name]) for row in cells), 1),
+        )
         for name in columns
     }
     shown = list(columns)

@@ -27,6 +27,8 @@ LOCK_FILE = ".lock"
 AGENT = "agent:"
 _POLICY = "rl_model_"
 _AGENT_OUTPUTS = "agents"  # below the folder of all runs
+_ID = re.compile(r"[0-9a-f]{4}")
+_ID_ATTEMPTS = 20  # then an id may repeat: there are thousands of runs
 # The C loader is ten times faster, and there may be thousands of runs.
 _Loader = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 
@@ -67,7 +69,7 @@ class RunDirectory:
         try:
             day.mkdir(parents=True, exist_ok=True)
             while True:
-                path = day / f"{name}-{secrets.token_hex(2)}"
+                path = day / f"{name}-{_new_id(base)}"
                 try:
                     path.mkdir()
                 except FileExistsError:
@@ -78,6 +80,12 @@ class RunDirectory:
                 f"The run directory cannot be created in '{base}': {error.strerror}. "
                 f"Choose another place with base_logdir=DIR."
             ) from error
+
+    @property
+    def id(self) -> str:
+        """The short id, with which commands find the run: the last four letters of its name."""
+        suffix = self.path.name.rpartition("-")[2]
+        return suffix if _ID.fullmatch(suffix) and not self.is_agent else str(self.path.name)
 
     def __truediv__(self, name: str) -> Path:
         return self.path / name
@@ -153,6 +161,15 @@ class RunDirectory:
     def publish_as_last(self, base: Path) -> None:
         """Let ``<base>/last`` point to this run."""
         files.point_to(base / LAST_LINK, self.path)
+
+
+def _new_id(base: Path) -> str:
+    """Draw an id that no run has, as far as that is possible with four letters."""
+    for _ in range(_ID_ATTEMPTS):
+        drawn = secrets.token_hex(2)
+        if not any(base.glob(f"*/*-{drawn}")):
+            break
+    return drawn
 
 
 def _lock_if_free(file: IO[str]) -> bool:
@@ -233,12 +250,13 @@ def find_agent(name: str) -> Path:
 def all_runs(base: Path) -> Iterator[RunDirectory]:
     """Yield the runs below a base directory, oldest first."""
     for config in sorted(base.glob(f"*/*/{CONFIG_FILE}")):
-        if not config.parent.parent.is_symlink():
+        is_half_removed = config.parent.name.startswith(".")
+        if not config.parent.parent.is_symlink() and not is_half_removed:
             yield RunDirectory(config.parent)
 
 
 def find_run(name: str, base: Path) -> RunDirectory:
-    """Find a run by ``last``, ``agent:NAME``, its path, or a unique part of its directory's name.
+    """Find a run by ``last``, ``agent:NAME``, its path, its id, or a unique part of its name.
 
     Args:
         name: What the user typed; also the path of a saved policy inside a run.
@@ -252,13 +270,14 @@ def find_run(name: str, base: Path) -> RunDirectory:
             if (candidate / CONFIG_FILE).is_file():
                 return _opened(candidate.resolve(), base)
     runs = {run.path.name: run for run in all_runs(base)}
-    fitting = [run for run_name, run in runs.items() if name and name in run_name]
+    fitting = [run for run in runs.values() if run.id == name]
+    fitting = fitting or [run for run_name, run in runs.items() if name and name in run_name]
     if len(fitting) == 1:
         return fitting[0]
     if fitting:
         raise ConfigError(
-            f"'{name}' fits {len(fitting)} runs in '{base}'; give more of the name, for example "
-            f"'{fitting[-1].path.name}'."
+            f"'{name}' fits {len(fitting)} runs in '{base}'; give the id of one, or more of the "
+            f"name, for example '{fitting[-1].path.name}'."
         )
     raise ConfigError(
         f"No run '{name}' in '{base}'.{did_you_mean(name, runs)} "

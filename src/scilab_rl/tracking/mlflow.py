@@ -95,6 +95,17 @@ class MLflowTracker(SyncableTracker):
             is_closed=has_all_parameters and known.info.status == _final_status(result),
         )
 
+    def delete(self, run: TrackedRun) -> bool:
+        """Move a run to MLflow's trash, which ``mlflow gc`` empties.
+
+        Returns:
+            Whether it was there.
+        """
+        known = self._find(run)
+        if known is not None:
+            self._client.delete_run(known.info.run_id)
+        return known is not None
+
     def _find(self, run: TrackedRun) -> Any:
         """Return the run as the database knows it, or None; opens the database."""
         _apply_settings()

@@ -1,3 +1,4 @@
+import json
 import logging
 
 import pytest
@@ -5,6 +6,7 @@ import pytest
 from scilab_rl.cli import runs
 from scilab_rl.errors import ConfigError
 from scilab_rl.results import RunResult
+from scilab_rl.run.annotations import write_annotations
 from scilab_rl.run.directory import CONFIG_FILE, RESULT_FILE
 
 from .conftest import read_json, read_table
@@ -34,6 +36,8 @@ def test_a_run_is_one_line(make_run, tmp_path, capsys):
     assert read_table(capsys.readouterr().out) == [
         {
             "run": "100000-a",
+            "id": "100000-a",
+            "started": "2026-01-02 10:00",
             "env": "FetchReach-v4",
             "algorithm": "sac",
             "seed": "7",
@@ -139,3 +143,68 @@ def test_runs_whose_environment_has_changed_are_told(
     caplog.clear()
     runs.main(["--base-logdir", str(tmp_path / "data"), "--last", "2"])
     assert caplog.messages == []
+
+
+def typed(run, *overrides):
+    text = json.dumps({"overrides": overrides})
+    (run / "provenance.json").write_text(text, encoding="utf-8")
+    return run
+
+
+def test_what_was_changed_is_shown_without_what_other_columns_show(make_run, listed):
+    intrinsic = {"name": "sac", "intrinsic": {"name": "rnd", "weight": 0.5}}
+    typed(
+        make_run("100000-FetchReach-v4-sac-s7-0a1f", result(), algorithm=intrinsic),
+        "algorithm=sac", "env=FetchReach", "seed=7", "++algorithm.gamma=0.9", "render=record",
+        "algorithm.intrinsic=rnd", "algorithm.intrinsic.weight=0.5", "++tracking.x=false",
+        "n_epochs=3",
+    )  # fmt: skip
+    (row,) = listed()
+    assert row["id"] == "0a1f"
+    assert row["changed"] == ["gamma=0.9", "intrinsic.weight=0.5", "n_epochs=3"]
+    assert row["intrinsic"] == "rnd"
+
+
+def test_the_runs_of_a_study_are_one_line(make_run, listed, tmp_path, capsys):
+    study = tmp_path / "data" / "studies" / "wide"
+    study.mkdir(parents=True)
+    (study / "study.yaml").touch()
+    make_run("100000-a", result())
+    for index, success in enumerate((0.2, 0.8, 0.5)):
+        make_run(f"11000{index}-b", result(metrics={"eval/success_rate": success}), group="wide")
+    make_run("120000-c", result(), group="narrow")
+    base = ["--base-logdir", str(tmp_path / "data")]
+    runs.main(base)
+    rows = read_table(capsys.readouterr().out)
+    assert [row["run"] for row in rows] == ["100000-a", "wide", "120000-c"]
+    assert (rows[1]["status"], rows[1]["success"]) == ("3 runs", "0.8")
+    runs.main([*base, "--last", "2"])
+    assert [row["run"] for row in read_table(capsys.readouterr().out)] == ["wide", "120000-c"]
+    assert [row["study"] for row in listed()] == [None, "wide", "wide", "wide", None]
+    assert len(listed("--study", "wide")) == 3
+    runs.main([*base, "--unfold"])
+    assert len(read_table(capsys.readouterr().out)) == 5
+
+
+def test_notes_and_tags_are_shown_and_filter(make_run, listed):
+    make_run("100000-a", result(), tags=["old"])
+    write_annotations(make_run("110000-b", result()), "looks\nodd", ["new", "new", "x"])
+    assert [(row["note"], row["tags"]) for row in listed()] == [
+        ("", ["old"]),
+        ("looks odd", ["new", "x"]),
+    ]
+    assert [row["run"] for row in listed("--tag", "x")] == ["110000-b"]
+
+
+def test_eighty_columns_are_enough(make_run, tmp_path, monkeypatch, capsys):
+    run = make_run("100000-FetchReach-v4-sac-s7-0a1f", result())
+    typed(run, "algorithm.gamma=0.9", "n_epochs=3", "algorithm.learning_rate=0.001")
+    write_annotations(run, "the one with the shaking arm", ["thesis"])
+    monkeypatch.setattr("scilab_rl.cli.runs.is_terminal", lambda: True)
+    monkeypatch.setattr("scilab_rl.cli.tables.is_terminal", lambda: True)
+    monkeypatch.setenv("COLUMNS", "80")
+    runs.main(["--base-logdir", str(tmp_path / "data")])
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
+    assert lines[0].split()[:3] == ["id", "env", "algorithm"]
+    assert {"changed", "status", "success", "note"} < set(lines[0].split())

@@ -182,12 +182,27 @@ def test_runs_are_found_by_last_path_part_and_policy(tmp_path):
 def test_a_name_that_fits_several_runs_or_none_says_what_to_do(tmp_path):
     make_run(tmp_path, "FetchReach-v4")
     other = make_run(tmp_path, "FetchReach-v4")
-    with pytest.raises(ConfigError, match=r"fits 2 runs in .*; give more of the name"):
+    with pytest.raises(ConfigError, match=r"fits 2 runs in .*; give the id of one, or more"):
         find_run("FetchReach", tmp_path)
     with pytest.raises(ConfigError, match=f"Did you mean '{other.path.name}'"):
         find_run(other.path.name[:-1] + "?", tmp_path)
     with pytest.raises(ConfigError, match="No run"):
         find_run("", tmp_path)
+
+
+def test_an_id_names_one_run_even_if_other_names_contain_it(tmp_path):
+    for name in ("120000-E-sac-s1-3412", "341200-E-sac-s1-beef", "120000-E-sac-s3412-cafe"):
+        (tmp_path / "2026-01-02" / name).mkdir(parents=True)
+        (tmp_path / "2026-01-02" / name / CONFIG_FILE).write_text("env: x\n")
+    assert find_run("3412", tmp_path).path.name == "120000-E-sac-s1-3412"
+    assert [run.id for run in all_runs(tmp_path)] == ["3412", "cafe", "beef"]
+
+
+def test_a_new_run_gets_an_id_that_no_run_has(tmp_path, monkeypatch):
+    drawn = iter(["aaaa", "aaaa", "aaaa", "bbbb"])
+    monkeypatch.setattr("scilab_rl.run.directory.secrets.token_hex", lambda _: next(drawn))
+    assert make_run(tmp_path, "E").id == "aaaa"
+    assert make_run(tmp_path, "Other").id == "bbbb"
 
 
 def test_the_link_to_the_last_run_is_not_listed_as_another_run(tmp_path):

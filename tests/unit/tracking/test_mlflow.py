@@ -77,6 +77,13 @@ def test_a_run_has_name_tags_and_all_parameters(started):
     assert len(data.params) == len(run.parameters) > 153
 
 
+def test_a_deleted_run_is_in_the_trash_and_deleted_once(started):
+    tracker, run = started
+    assert tracker.delete(run)
+    assert stored(tracker).info.lifecycle_stage == "deleted"
+    assert not tracker.delete(run)
+
+
 def test_runs_of_a_group_are_shown_below_one_run(started):
     from scilab_rl.tracking.mlflow import MLflowTracker
 
