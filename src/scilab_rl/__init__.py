@@ -1,7 +1,53 @@
 """Scilab-RL: goal-conditioned reinforcement learning that shows what the agent thinks.
 
+.. code-block:: python
+
+    import scilab_rl
+
+    agent = scilab_rl.load("agent:FetchPush")
+    env = agent.make_env(render_mode="rgb_array")
+    observation, _ = env.reset(seed=0)
+    action = agent.predict(observation)
+
 Importing the package imports nothing heavy: simulators, PyTorch and trackers are loaded where they
-are used.
+are used. The environments are registered with Gymnasium as soon as both packages are imported, in
+either order.
 """
 
+from __future__ import annotations
+
+from scilab_rl.envs.on_import import register_when_imported
+
+TYPE_CHECKING = False  # that of `typing`, whose import would take longer than all the rest
+if TYPE_CHECKING:
+    from scilab_rl.api.agent import Agent, EvaluationSummary, load
+    from scilab_rl.errors import ConfigError, ScilabRLError
+
 __version__ = "1.0.0.dev0"
+# Name to the module that it is imported from when it is used first.
+_API = {
+    "Agent": "scilab_rl.api.agent",
+    "ConfigError": "scilab_rl.errors",
+    "EvaluationSummary": "scilab_rl.api.agent",
+    "ScilabRLError": "scilab_rl.errors",
+    "load": "scilab_rl.api.agent",
+}
+__all__ = [
+    "Agent", "ConfigError", "EvaluationSummary", "ScilabRLError", "__version__", "load",
+]  # fmt: skip
+
+
+def __getattr__(name: str) -> object:
+    if name not in _API:
+        raise AttributeError(f"module 'scilab_rl' has no attribute '{name}'")
+    import importlib
+
+    found = globals()[name] = getattr(importlib.import_module(_API[name]), name)
+    return found
+
+
+def __dir__() -> list[str]:
+    return __all__
+
+
+register_when_imported()

@@ -66,21 +66,17 @@ def _agent(run: RunDirectory, options: argparse.Namespace) -> int:
 def _trials(
     run: RunDirectory, cfg: RunConfig, options: argparse.Namespace
 ) -> Sequence[Mapping[str, object]]:
-    from scilab_rl.run.player import load_player
-    from scilab_rl.training.trajectory_table import by_episode, collect, softmax_choice
+    from scilab_rl.api.agent import Agent
 
     policy = find_policy(run, options.run, options.policy, "best", "finished")
-    env, model = load_player(cfg, policy, record=False)
-    seed = options.seed or int(cfg.seed) + 1
-    choose = None
-    if options.softmax is not None:
-        choose = softmax_choice(model, options.softmax, seed)
-    rows = collect(
-        model, env, options.episodes or 20, seed, choose=choose, most_dimensions=options.dimensions
-    )
-    env.close()
-    chosen = by_episode(rows) if options.per == "episode" else rows
-    return [dict(row) for row in chosen]
+    with Agent(run, cfg, policy) as agent:
+        return agent.trajectories(
+            options.episodes or 20,
+            per=options.per,
+            seed=options.seed or None,
+            softmax=options.softmax,
+            dimensions=options.dimensions,
+        )
 
 
 def _training_episodes(run: RunDirectory) -> Sequence[Mapping[str, object]]:

@@ -1,7 +1,8 @@
 """The environments of Scilab-RL, and the long ids that name their variants.
 
-A variant such as ``Blocks-o2-gripper_above-v1`` is not one of thousands of registered ids: its name
-is read, and this one variant is registered on request.
+The variants of a maze are not thousands of registered ids: the name is read, and this one variant
+is registered on request. Variants that are few, such as ``Blocks-o2-gripper_above-v1``, are
+registered from the beginning, so that ``gymnasium.make`` knows them.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
-import gymnasium as gym
+from gymnasium.envs import registration
 
 from scilab_rl.errors import ConfigError
 
@@ -30,6 +31,8 @@ class Family:
         grammar: What the names of its variants look like, for people.
         pattern: The same as a regular expression; its groups are keyword arguments.
         read: Turns the groups into keyword arguments and, under ``max_episode_steps``, the limit.
+        variants: Names of the variants, without version, where they are few: those are registered
+            from the beginning, for ``gymnasium.make``.
     """
 
     env_id: str
@@ -38,6 +41,7 @@ class Family:
     grammar: str = ""
     pattern: str = "(?!)"
     read: Callable[[Mapping[str, str]], Arguments] = field(default=lambda groups: {})
+    variants: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -97,6 +101,9 @@ _PLACE = (
 )
 _PLACE_GRAMMAR = f"THRESHOLD-MAP-c{{0,1}}-rt{{0,1}}-sSTEPS-v0, MAP one of {', '.join(_MAPS)}"
 _REWARD_GRAMMAR = "{sparse,sparseneg,dense}"
+_BLOCKS = tuple(
+    f"Blocks-o{n}-gripper_{goal}" for n in range(1, 5) for goal in ("none", "random", "above")
+)
 
 FAMILIES = (
     Family("Reach1DOF-v0", "scilab_rl.envs.reach_1dof:Reach1DOF", 50),
@@ -108,6 +115,7 @@ FAMILIES = (
         r"Blocks-(?!o0-gripper_(?:none|above))"
         r"o(?P<n_blocks>[0-4])-gripper_(?P<gripper_goal>none|random|above)",
         _read_blocks,
+        ("Blocks-o0-gripper_random", *_BLOCKS),
     ),
     Family("CoppeliaReach-v0", "scilab_rl.envs.coppeliasim_tasks:CoppeliaReach", 50),
     Family("CoppeliaDrive-v0", "scilab_rl.envs.coppeliasim_tasks:CoppeliaDrive", 100),
@@ -118,6 +126,7 @@ FAMILIES = (
         "Hook-o{0..2}-v1",
         r"Hook-o(?P<n_blocks>[0-2])",
         _read_hook,
+        tuple(f"Hook-o{n}" for n in range(3)),
     ),
     Family(
         "ButtonUnlock-v1",
@@ -126,6 +135,7 @@ FAMILIES = (
         "ButtonUnlock-o{0..2}-v1",
         r"ButtonUnlock-o(?P<n_buttons>[0-2])",
         _read_buttons,
+        tuple(f"ButtonUnlock-o{n}" for n in range(3)),
     ),
     Family(
         "PointGym-v0",
@@ -169,12 +179,21 @@ FAMILIES = (
 def register_shipped() -> None:
     """Make the ids known; nothing is imported before one of them is made."""
     for family in FAMILIES:
-        if family.env_id not in gym.registry:
-            gym.register(
+        if family.env_id not in registration.registry:
+            registration.register(
                 family.env_id,
                 entry_point=family.entry_point,
                 max_episode_steps=family.max_episode_steps,
             )
+        for name in family.variants:
+            register_variant(name)
+
+
+def is_variant(env_id: str) -> bool:
+    """Return whether an id names a variant of one of our environments."""
+    return any(f.grammar and env_id.startswith(f"{f.name}-") for f in FAMILIES) and not any(
+        env_id == family.env_id for family in FAMILIES
+    )
 
 
 def register_variant(name: str) -> tuple[str, str] | None:
@@ -204,8 +223,8 @@ def register_variant(name: str) -> tuple[str, str] | None:
 
 def _register(family: Family, env_id: str, arguments: Arguments) -> str:
     limit = arguments.pop("max_episode_steps", family.max_episode_steps)
-    if env_id not in gym.registry:
-        gym.register(env_id, family.entry_point, max_episode_steps=limit, kwargs=arguments)
+    if env_id not in registration.registry:
+        registration.register(env_id, family.entry_point, max_episode_steps=limit, kwargs=arguments)
     meaning = ", ".join(f"{key}={value}" for key, value in arguments.items())
     steps = "" if limit is None else f", {limit} steps"
     return f"{env_id} is {family.env_id} with {meaning}{steps}."

@@ -11,7 +11,7 @@ from collections.abc import Iterable
 import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 
-from scilab_rl.envs.ids import register_shipped, register_variant
+from scilab_rl.envs.ids import is_variant, register_shipped, register_variant
 from scilab_rl.envs.suites import SUITES, Suite, suite_of_module, suite_of_name
 from scilab_rl.errors import ConfigError, MissingDependencyError, did_you_mean
 
@@ -65,11 +65,11 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
 
 
 def known_env_ids() -> list[str]:
-    """Return the usable ids of all installed suites."""
+    """Return the usable ids of all installed suites, without the variants that long ids name."""
     for suite in SUITES:
         if suite.begins and suite.installed:
             _register(suite.package)
-    return [spec.id for spec in gym.registry.values() if _is_usable(spec)]
+    return [s.id for s in gym.registry.values() if _is_usable(s) and not is_variant(s.id)]
 
 
 def _usable_specs(family: str) -> list[EnvSpec]:

@@ -56,13 +56,19 @@ def make_train_env(cfg: RunConfig, render_mode: str | None = None) -> VecEnv:
 
 def make_eval_env(cfg: RunConfig, render_mode: str | None = None) -> VecEnv:
     """Make the single environment for evaluation, with its own stream of seeds."""
-    # What only changes rewards, to learn better, does not change what is measured.
-    wrappers = [wrapper for wrapper in _wrappers(cfg) if not _is_a(wrapper, gym.RewardWrapper)]
-    cfg = replace(cfg, n_envs=1, vector="inprocess", wrappers=wrappers)
-    env = _make(cfg, "eval", render_mode)
+    env = _make(for_evaluation(cfg), "eval", render_mode)
     if (normalization := unwrap_vec_normalize(env)) is not None:
         normalization.training = normalization.norm_reward = False  # measure, don't adapt
     return env
+
+
+def for_evaluation(cfg: RunConfig) -> RunConfig:
+    """Return the configuration of the single environment for evaluation.
+
+    What only changes rewards, to learn better, does not change what is measured.
+    """
+    wrappers = [wrapper for wrapper in _wrappers(cfg) if not _is_a(wrapper, gym.RewardWrapper)]
+    return replace(cfg, n_envs=1, vector="inprocess", wrappers=wrappers)
 
 
 def make_single_env(

@@ -89,6 +89,10 @@ class AgentInspector:
         """Return what each critic says about an action. Shapes: result ``(n_critics,)``."""
         return self._q_values(self._batch(observation), self._action(action))[0]
 
+    def q_values_of_batch(self, observations: Observation, actions: np.ndarray) -> np.ndarray:
+        """Return what each critic says about each action. Shapes: result ``(batch, n_critics)``."""
+        return self._q_values(self.normalized(observations), self._actions.from_env(actions))
+
     def value(self, observation: Observation) -> float:
         """Return the value of an observation.
 
@@ -138,9 +142,9 @@ class AgentInspector:
         """
         with self.undisturbed():
             answer = self._ask[INTRINSIC_REWARD](
-                self._normalized(observations),
+                self.normalized(observations),
                 self._actions.from_env(actions),
-                self._normalized(next_observations),
+                self.normalized(next_observations),
             )
         return _numbers(answer).reshape(-1)
 
@@ -178,12 +182,13 @@ class AgentInspector:
         return _numbers(self._ask[Q_VALUES](batch, actions))
 
     def _batch(self, observation: Observation) -> Observation:
-        return self._normalized(batch_of_one(observation))
+        return self.normalized(batch_of_one(observation))
 
     def _action(self, action: npt.ArrayLike) -> np.ndarray:
         return self._actions.from_env(np.asarray(action)[None])
 
-    def _normalized(self, batch: Observation) -> Observation:
+    def normalized(self, batch: Observation) -> Observation:
+        """Return a batch of the environment's observations as the algorithm reads it."""
         for function in self._functions:
             batch = function(batch)
         return batch
