@@ -51,7 +51,7 @@ def build_algorithm(
     """
     arguments = dict(arguments)
     if accepts(cls, "policy") and arguments.get("policy", "auto") == "auto":
-        arguments["policy"] = policy_name(env)
+        arguments["policy"] = policy_name(env, cls)
     if "replay_buffer_class" in arguments:
         _choose_replay_buffer(arguments, env)
     if isinstance(noise := arguments.get("action_noise"), ActionNoise):
@@ -72,11 +72,13 @@ def build_algorithm(
     return algorithm
 
 
-def policy_name(env: VecEnv) -> str:
-    """Return Stable-Baselines3's name of the policy that reads these observations."""
+def policy_name(env: VecEnv, cls: object) -> str:
+    """Return an algorithm's name of the policy that reads these observations."""
+    kind = "Cnn" if is_large_image(env.observation_space) else "Mlp"
     if hasattr(env.observation_space, "spaces"):
-        return "MultiInputPolicy"
-    return "CnnPolicy" if is_large_image(env.observation_space) else "MlpPolicy"
+        kind = "MultiInput"
+    recurrent = f"{kind}LstmPolicy"
+    return recurrent if recurrent in getattr(cls, "policy_aliases", ()) else f"{kind}Policy"
 
 
 def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:

@@ -36,6 +36,7 @@ ORACLE = {
     "ppo": _SB3_ALL,
     "qrdqn": _CHOICES,
     "random": _ALL,
+    "recurrentppo": _SB3_ALL,
     "sac": _SB3_MOVES,
     "td3": _SB3_MOVES,
     "tqc": _SB3_MOVES,
@@ -143,7 +144,9 @@ def test_f29_odd_spaces_work(algorithm: str, name: str, tmp_path: Path) -> None:
 
 
 def train(algorithm: str, name: str, tmp_path: Path, *overrides: str) -> None:
-    more = ["algorithm.n_steps=16"] if algorithm in ("ppo", "cleanppo", "trpo") else []
+    more = (
+        ["algorithm.n_steps=16"] if algorithm in ("ppo", "cleanppo", "recurrentppo", "trpo") else []
+    )
     more += ["algorithm.batch_size=16"] if more else []
     more += ["algorithm.buffer_size=200"] if algorithm in ("dqn", "qrdqn", "cleandqn") else []
     done = scilab_rl(f"algorithm={algorithm}", f"env={MODULE}:{name}", *SHORT, *more, *overrides,

@@ -119,6 +119,7 @@ FAMILIES = (
     ),
     Family("CoppeliaReach-v0", "scilab_rl.envs.coppeliasim_tasks:CoppeliaReach", 50),
     Family("CoppeliaDrive-v0", "scilab_rl.envs.coppeliasim_tasks:CoppeliaDrive", 100),
+    Family("CueMemory-v0", "scilab_rl.envs.cue_memory:CueMemory", 100),
     Family(
         "Hook-v1",
         "scilab_rl.envs.hook:Hook",

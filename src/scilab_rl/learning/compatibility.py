@@ -30,6 +30,7 @@ _ACTION_SPACES: dict[str, tuple[type[spaces.Space], ...]] = {
     "DQN": _DISCRETE,
     "QRDQN": _DISCRETE,
     "PPO": _ANY,
+    "RecurrentPPO": _ANY,
     "A2C": _ANY,
     "TRPO": _ANY,
 }
@@ -62,7 +63,8 @@ def supported_action_spaces(cls: type) -> tuple[type[spaces.Space], ...] | None:
 def reads_dictionaries(cls: type) -> bool:
     """Return whether an algorithm class has a policy for Dict observations, and so for goals."""
     # CrossQ of sb3-contrib has none. One-file algorithms have no list of policies and read all.
-    return "MultiInputPolicy" in getattr(cls, "policy_aliases", ("MultiInputPolicy",))
+    names = {"MultiInputPolicy", "MultiInputLstmPolicy"}
+    return not names.isdisjoint(getattr(cls, "policy_aliases", names))
 
 
 def is_goal_space(space: spaces.Space) -> bool:

@@ -76,6 +76,7 @@ class AgentInspector:
         self._functions = _observation_functions(algorithm.get_env())
         self.reason = why_not_asked(algorithm.get_env())
         self._ask = {} if self.reason else _methods(algorithm)
+        self._memory = None if self.reason else _memory_of(algorithm)
         self.quantities = frozenset(self._ask) | _derived(algorithm, set(self._ask))
         if Q_VALUES in self._ask and self._count_critics() > 1:
             self.quantities |= {SECOND_CRITIC}
@@ -153,6 +154,18 @@ class AgentInspector:
         if self._normalization is None:
             return float(reward)
         return float(self._normalization.normalize_reward(np.array([reward]))[0])
+
+    def after(self, observation: Observation) -> AgentInspector:
+        """Return the inspector of the next step, which remembers an observation if policies do.
+
+        A new inspector remembers nothing: its first observation begins an episode.
+        """
+        if self._memory is None:
+            return self
+        later = copy.copy(self)
+        later._memory = self._memory.after(self._batch(observation))
+        later._ask = self._ask | later._memory.methods()
+        return later
 
     @contextlib.contextmanager
     def undisturbed(self) -> Iterator[None]:
@@ -258,6 +271,8 @@ def _stable_baselines_methods(algorithm: object) -> dict[str, Callable[..., Answ
     policy = getattr(algorithm, "policy", None)
     if policy is None or not callable(getattr(policy, "obs_to_tensor", None)):
         return {}
+    if (memory := _memory_of(algorithm)) is not None:
+        return memory.methods()
     networks = _PolicyNetworks(policy)
     if hasattr(policy, "predict_values"):  # PPO, A2C, TRPO
         return {
@@ -273,6 +288,68 @@ def _stable_baselines_methods(algorithm: object) -> dict[str, Callable[..., Answ
             asked[LOG_PROB] = networks.actor_log_prob
         return asked
     return {}
+
+
+def _memory_of(algorithm: object) -> _RecurrentNetworks | None:
+    policy = getattr(algorithm, "policy", None)
+    return _RecurrentNetworks(policy) if hasattr(policy, "lstm_actor") else None
+
+
+class _RecurrentNetworks:
+    """The networks of sb3-contrib's recurrent policies at one step of an episode, with its memory.
+
+    Args:
+        policy: The policy.
+        states: Hidden and cell states of the actor's and of the critic's LSTM after the steps
+            before; None: zeros, as at the first step.
+            Shapes: ``(n_layers, 1, lstm_hidden_size)`` each.
+    """
+
+    def __init__(self, policy: Any, states: Any = None) -> None:
+        self.policy = policy
+        if states is None:
+            from sb3_contrib.common.recurrent.type_aliases import RNNStates  # slow to import
+
+            zeros = torch.zeros(policy.lstm_hidden_state_shape, device=policy.device)
+            states = RNNStates((zeros, zeros), (zeros, zeros))
+        self._states = states
+        self._starts = torch.zeros(1, device=policy.device)
+
+    def methods(self) -> dict[str, Callable[..., Answer]]:
+        """Return how to ask for each quantity."""
+        return {
+            VALUE: self.state_values,
+            LOG_PROB: self.evaluated_log_prob,
+            ENTROPY: self.exact_entropy,
+        }
+
+    def after(self, batch: Observation) -> _RecurrentNetworks:
+        """Return the networks at the next step."""
+        with torch.no_grad():
+            *_, states = self.policy(
+                self._tensor(batch), self._states, self._starts, deterministic=True
+            )
+        return _RecurrentNetworks(self.policy, states)
+
+    def state_values(self, batch: Observation) -> torch.Tensor:
+        """Return the value network's answer."""
+        return self.policy.predict_values(self._tensor(batch), self._states.vf, self._starts)
+
+    def evaluated_log_prob(self, batch: Observation, actions: np.ndarray) -> torch.Tensor:
+        """Return the log probability of actions in the environment's units."""
+        return self._distribution(batch).log_prob(
+            torch.as_tensor(actions, device=self.policy.device)
+        )
+
+    def exact_entropy(self, batch: Observation) -> torch.Tensor:
+        """Return the policy's entropy."""
+        return self._distribution(batch).entropy()
+
+    def _distribution(self, batch: Observation) -> Any:
+        return self.policy.get_distribution(self._tensor(batch), self._states.pi, self._starts)[0]
+
+    def _tensor(self, batch: Observation) -> Tensors:
+        return self.policy.obs_to_tensor(batch)[0]
 
 
 class _PolicyNetworks:

@@ -86,6 +86,9 @@ class Inspectable(Protocol):
     def learned_reward(self, reward: float) -> float:
         """A reward in the scale that the critics learn."""
 
+    def after(self, observation: Observation) -> Inspectable:
+        """The same for the next step: a recurrent policy remembers the observation."""
+
 
 @dataclass(frozen=True)
 class Probe:
@@ -166,7 +169,8 @@ def td_error(
 
     A terminal state has no value; one where the episode was only cut off (truncated) has.
     """
-    future = 0.0 if terminated else inspector.gamma * inspector.value(next_observation)
+    later = inspector.after(observation)
+    future = 0.0 if terminated else inspector.gamma * later.value(next_observation)
     if "q_values" in inspector.quantities:
         expected = q_value(inspector, observation, action)
     else:
@@ -342,9 +346,14 @@ class EpisodeProbes:
     def __post_init__(self) -> None:
         self._functions = [(probe, probe.make()) for probe in self.probes]
 
-    def of_step(self, *arguments: object) -> dict[Curve, float]:
-        """Return the values of a step, given what follows the algorithm in `ARGUMENTS`."""
-        return self._values(self._functions, arguments)
+    def of_step(self, observation: Observation, *arguments: object) -> dict[Curve, float]:
+        """Return the values of a step, given what follows the algorithm in `ARGUMENTS`.
+
+        Steps come in the order of the episode, so that a recurrent policy remembers them.
+        """
+        values = self._values(self._functions, (observation, *arguments))
+        self.inspector = self.inspector.after(observation)
+        return values
 
     def of_scene(self, observation: Observation) -> dict[Curve, float]:
         """Return what can be said of the last scene, in which nothing is done any more."""

@@ -36,6 +36,9 @@ Node = Any  # JSON: a plain value, or {"@kind": ...}
 RandomState = dict[str, Any]  # of the global generators
 
 _OPEN_PACKAGES = ("stable_baselines3", "sb3_contrib", "scilab_rl", "custom_algorithms")
+# What a recurrent policy remembers of the running episodes: it belongs to them, not to the policy,
+# which may act in another number of environments.
+_OF_EPISODES = ("_last_lstm_states",)
 # State of a module other than parameters and buffers: counters, running means, exploration.
 _KEPT_IN_MODULES = (
     bool, int, float, np.ndarray, torch.Tensor, np.random.Generator, torch.optim.Optimizer,
@@ -254,6 +257,7 @@ class _Capture:
         attributes = {
             name: self.describe(attribute, f"{path}.{name}", rows)
             for name, attribute in vars(value).items()
+            if self.with_buffers or name not in _OF_EPISODES
         }
         kept = {name: node for name, node in attributes.items() if node != {"@kind": "skip"}}
         return {"@kind": "object", "attributes": kept}

@@ -64,14 +64,14 @@ def collect(
     task, newest = observed_layer(env), _Newest()
     task.observers.append(newest)
     env.seed(seed)
-    seen = env.reset()
+    seen, act = env.reset(), _Actor(model, env, choose)
     rows: list[Row] = []
     try:
         for episode in range(n_episodes):
             asked = EpisodeProbes(inspector, probes, _log.warning)
             step, total, done = 0, 0.0, False
             while not done:
-                seen = env.step(_act(model, seen, env, choose))[0]
+                seen = env.step(act(seen, begins=step == 0))[0]
                 taken = newest.step
                 done, total = bool(taken.dones[0]), total + float(taken.rewards[0])
                 row = _row(inspector, asked, taken, env, most_dimensions, total)
@@ -201,12 +201,22 @@ def softmax_choice(model: Algorithm, inverse_temperature: float, seed: int) -> C
     return choose
 
 
-def _act(model: Algorithm, seen: VecEnvObs, env: VecEnv, choose: Choose | None) -> np.ndarray:
-    """Return the action as the algorithm has it, in a batch of one."""
-    if choose is None:
-        return model.predict(seen, deterministic=True)[0]
-    chosen = choose(single(observed_layer(env).observations, 0))
-    return conversions(env)[0].from_env(np.asarray(chosen)[None])
+class _Actor:
+    """Chooses actions, as the algorithm has them, and carries the memory of a recurrent policy."""
+
+    def __init__(self, model: Algorithm, env: VecEnv, choose: Choose | None) -> None:
+        self._model, self._env, self._choose = model, env, choose
+        self._memory: tuple[np.ndarray, ...] | None = None
+
+    def __call__(self, seen: VecEnvObs, *, begins: bool) -> np.ndarray:
+        """Return the action in a batch of one; ``begins``: this is an episode's first step."""
+        if self._choose is not None:
+            chosen = self._choose(single(observed_layer(self._env).observations, 0))
+            return conversions(self._env)[0].from_env(np.asarray(chosen)[None])
+        action, self._memory = self._model.predict(
+            seen, state=self._memory, episode_start=np.array([begins]), deterministic=True
+        )
+        return action
 
 
 def _action_values(inspector: AgentInspector, observation: Observation, env: VecEnv) -> Row:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import copy
 import math
 from typing import Any
 
@@ -13,9 +14,11 @@ from stable_baselines3.common.vec_env import VecNormalize
 import scilab_rl.testing  # noqa: F401 - registers the tiny environments
 from scilab_rl.algorithms.cleansac import CLEANSAC
 from scilab_rl.algorithms.random import RANDOM
+from scilab_rl.building import policy_name
 from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs.vectorize import make_train_env
 from scilab_rl.learning.inspector import AgentInspector
+from scilab_rl.metrics.probes import EpisodeProbes, built_in
 
 
 def small() -> dict[str, Any]:
@@ -54,14 +57,15 @@ def first_step(algorithm: Any) -> tuple[Any, Any]:
         (stable_baselines3.PPO, "TinyDiscrete-v0", STATE, 0),
         (stable_baselines3.A2C, "TinyReach-v0", STATE | {"goals"}, 0),
         (sb3_contrib.TRPO, "TinyBox-v0", STATE, 0),
+        (sb3_contrib.RecurrentPPO, "TinyBox-v0", STATE, 0),
+        (sb3_contrib.RecurrentPPO, "TinyReach-v0", STATE | {"goals"}, 0),
     ],
 )
 def test_each_stable_baselines_algorithm_answers(
     cls: type, env_id: str, quantities: frozenset[str], n_critics: int
 ) -> None:
     env = make_env(env_id)
-    policy = "MultiInputPolicy" if env_id == "TinyReach-v0" else "MlpPolicy"
-    inspector = AgentInspector(cls(policy, env, **small()))
+    inspector = AgentInspector(cls(policy_name(env, cls), env, **small()))
     assert inspector.quantities == quantities | ({"second critic"} if n_critics > 1 else set())
     observation, action = first_step(inspector.algorithm)
     with inspector.undisturbed():
@@ -151,3 +155,29 @@ def test_normalised_observations_and_rewards_are_what_the_critics_learn() -> Non
     np.testing.assert_allclose(inspector.q_values(observation, action).ravel(), expected, rtol=1e-5)
     scale = math.sqrt(float(env.ret_rms.var) + env.epsilon)
     assert inspector.learned_reward(-2.0) == pytest.approx(max(-10.0, -2.0 / scale))
+
+
+def test_a_recurrent_policy_is_asked_with_its_memory() -> None:
+    """The probes of an episode say what acting has computed at each of its steps."""
+    model = sb3_contrib.RecurrentPPO("MlpLstmPolicy", make_env("CueMemory-v0"), **small())
+    env, states = model.get_env(), copy.deepcopy(model._last_lstm_states)
+    asked = EpisodeProbes(
+        AgentInspector(model), [built_in("td_error"), built_in("log_prob")], print
+    )
+    seen, start, previous = env.reset(), torch.ones(1), None
+    for _ in range(4):
+        with torch.no_grad():
+            acted = model.policy(torch.as_tensor(seen), states, start)
+        action, value, log_prob, states = acted
+        if previous is not None:  # r + gamma V(s') - V(s), where no answer is asked for: r = 0
+            surprise = model.gamma * value.item() - previous[0]
+            assert previous[1]["td_error"] == pytest.approx(surprise, abs=1e-6)
+        after = env.step(action.numpy())[0]
+        said = asked.of_step(seen[0], action.numpy()[0], 0.0, after[0], {}, False, False)
+        previous = value.item(), {curve.panel: number for curve, number in said.items()}
+        assert previous[1]["log_prob"] == pytest.approx(log_prob.item(), abs=1e-6)
+        seen, start = after, torch.zeros(1)
+    fresh = AgentInspector(model)
+    with fresh.undisturbed():
+        remembered = fresh.after(np.eye(6, dtype=np.float32)[0]).value(seen[0])
+        assert remembered != fresh.value(seen[0])  # and a new episode remembers nothing

@@ -49,6 +49,9 @@ class Mind:
     def learned_reward(self, reward: float) -> float:
         return reward
 
+    def after(self, observation: Any) -> Mind:
+        return self
+
 
 EVERYTHING = Mind(
     "q_values", "value", "log_prob", "entropy", "intrinsic_reward", "goals", "second critic"

@@ -6,6 +6,8 @@ import itertools
 
 import numpy as np
 import pytest
+import sb3_contrib
+import torch
 
 from scilab_rl.algorithms.cleandqn import CLEANDQN
 from scilab_rl.algorithms.cleansac import CLEANSAC
@@ -122,4 +124,22 @@ def test_tables_speak_of_the_environments_own_values() -> None:
     assert {int(choose(single)) for _ in range(30)} == {-1, 0, 1}
     chosen = collect(model, env, 2, seed=5, choose=choose)
     assert {row["action"] for row in chosen} == {-1, 0, 1}
+    env.close()
+
+
+def test_a_recurrent_policy_acts_with_its_memory() -> None:
+    """Each action is the one that the LSTM computes from the whole episode so far."""
+    env = make_eval_env(RunConfig("CueMemory-v0", seed=3))
+    model = sb3_contrib.RecurrentPPO("MlpLstmPolicy", env, seed=2, device="cpu")
+    with torch.no_grad():  # large weights, so that memory changes the likeliest action
+        for weights in model.policy.parameters():
+            weights *= 5
+    rows, state, forgetful = collect(model, env, 6, seed=5), None, []
+    for row in rows:
+        seen = np.array([[row[f"observation_{i}"] for i in range(6)]], np.float32)
+        starts = np.array([row["step"] == 0])
+        action, state = model.predict(seen, state, starts, deterministic=True)
+        assert row["action"] == action[0]
+        forgetful.append(model.predict(seen, deterministic=True)[0][0])
+    assert [row["action"] for row in rows] != forgetful
     env.close()
