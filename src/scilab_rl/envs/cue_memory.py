@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
-
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
@@ -37,7 +35,7 @@ class CueMemory(gym.Env):
         render_mode: ``rgb_array`` or None.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": ["rgb_array"], "render_fps": 5}
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 5}  # noqa: RUF012 - Gymnasium's
 
     def __init__(self, n_cues: int = 4, delay: int = 8, *, render_mode: str | None = None) -> None:
         require_choice("n_cues", n_cues, range(2, len(_COLORS) + 1))
