@@ -14,6 +14,7 @@ DEMO ?=
 export DO_NOT_TRACK ?= true
 export MLFLOW_DISABLE_TELEMETRY ?= true
 
+SHELL := bash
 .DEFAULT_GOAL := help
 .PHONY: help setup check format test test-slow smoke performance test-myosuite bench demo docs docs-figures gallery figure-fetchpush mlflow audit clean-venv
 
@@ -23,9 +24,13 @@ help:  ## list the targets
 $(VENV)/.installed: pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 10))' || \
 	  { echo "Scilab-RL needs Python 3.10 or newer; found $$($(PYTHON) --version). Try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 2; }
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet -c constraints.txt -e ".[$(EXTRAS)]"
+	@echo "Installing Scilab-RL and its libraries into $(VENV): about 3.3 GB, usually 2 to 5 minutes."
+	@echo "Smaller, without trackers, viewer and some environments: make setup EXTRAS=jax (README)."
+	@$(PYTHON) -m venv $(VENV)
+	@set -o pipefail; $(BIN)/pip install --progress-bar off -c constraints.txt -e ".[$(EXTRAS)]" \
+	  | tee $(VENV)/install.log | awk -f scripts/show_progress.awk
 	@touch $@
+	@[ "$(MAKECMDGOALS)" != setup ] || echo "Ready. Try: make demo"
 
 setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	@$(BIN)/python -m scilab_rl.cli.doctor --rendering-hint

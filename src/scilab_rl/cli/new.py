@@ -54,12 +54,17 @@ def main(arguments: list[str]) -> int:
         from scilab_rl.cli import new_environment
 
         return new_environment.main(arguments[1:])
+    if arguments[:1] == ["intrinsic"]:
+        from scilab_rl.cli import new_intrinsic
+
+        return new_intrinsic.main(arguments[1:])
     parser = CommandParser(
         "new",
-        "Create an algorithm of your own as a copy of an existing one, or an environment "
-        "(`scilab-rl new environment --help`).",
+        "Create an algorithm of your own as a copy of an existing one, or an environment or an "
+        "intrinsic reward (`scilab-rl new environment --help`, `scilab-rl new intrinsic --help`).",
     )
-    parser.add_argument("kind", choices=("algorithm", "environment"), help="what to create")
+    kinds = ("algorithm", "environment", "intrinsic")
+    parser.add_argument("kind", choices=kinds, help="what to create")
     parser.add_argument("name", help="its name, for example my_idea")
     parser.add_argument(
         "--from",
@@ -175,17 +180,26 @@ def contents_of(name: str, parent: Parent) -> dict[Path, str]:
         ConfigError: If one exists, or the parent's source already uses the name.
     """
     test = _TESTS / f"test_{name}.py"
-    contents = {
-        PROJECT_ALGORITHMS / f"{name}.py": source_of(name, parent),
-        PROJECT_CONF / "algorithm" / f"{name}.yaml": yaml_of(name, parent),
-        test: _TEST.format(name=name, camel=camel(name), path=test),
-    }
-    for path in (*contents, PROJECT_ALGORITHMS / name):
+    return new_files(
+        {
+            PROJECT_ALGORITHMS / f"{name}.py": source_of(name, parent),
+            PROJECT_CONF / "algorithm" / f"{name}.yaml": yaml_of(name, parent),
+            test: _TEST.format(name=name, camel=camel(name), path=test),
+        }
+    )
+
+
+def new_files(contents: dict[Path, str]) -> dict[Path, str]:
+    """Return the path and content of each new file, with the package that the first is in.
+
+    Raises:
+        ConfigError: If one of them exists.
+    """
+    for path in (*contents, next(iter(contents)).with_suffix("")):
         if path.exists():
             raise ConfigError(f"'{path}' already exists; choose another name.")
-    if not (package := PROJECT_ALGORITHMS / "__init__.py").exists():
-        contents[package] = _PACKAGE_DOCSTRING
-    return contents
+    package = PROJECT_ALGORITHMS / "__init__.py"
+    return contents if package.exists() else {**contents, package: _PACKAGE_DOCSTRING}
 
 
 def source_of(name: str, parent: Parent) -> str:

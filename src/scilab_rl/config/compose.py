@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from scilab_rl.config.overrides import as_text, as_texts, tuple_as_list
 from scilab_rl.config.schema import ALIASES, KEYS, STRING, RunConfig, Values, unknown_key
-from scilab_rl.config.workspace import config_files
+from scilab_rl.config.workspace import SHIPPED_CONF, config_files
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 
 _log = logging.getLogger(__name__)
@@ -56,10 +56,13 @@ def compose_values(overrides: Sequence[str], composed: DictConfig | None = None)
     if tuned is None:
         return values
     RunConfig.from_values(values)  # errors before notices
-    _log.info(
+    path = config_files("tuned_values")[tuned]
+    _log.log(
+        # The line that begins a run names shipped values, too; those of a project may be forgotten.
+        logging.DEBUG if path.is_relative_to(SHIPPED_CONF) else logging.INFO,
         "Tuned values for %s are used: %s (off with tuned=false).",
         tuned.replace("/", " with "),
-        _near(config_files("tuned_values")[tuned]),
+        _near(path),
     )
     return _plain([f"+tuned_values={tuned}", *overrides])
 

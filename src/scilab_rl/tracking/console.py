@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from scilab_rl.config.compose import tuned_option
 from scilab_rl.results import RunResult
 from scilab_rl.tracking.base import TrackedRun, Tracker
 
@@ -37,9 +38,10 @@ class ConsoleTracker(Tracker):
     def begin(self, run: TrackedRun) -> None:
         """Say what begins and show the bar."""
         self._run, cfg = run, run.cfg
+        tuned = " with tuned values" if tuned_option(cfg.values()) else ""
         self._say(
-            f"{cfg.algorithm.name} learns {cfg.env} (seed {cfg.seed}, up to {cfg.n_epochs} "
-            f"epochs); everything goes to {run.run_dir}"
+            f"{cfg.algorithm.name} learns {cfg.env}{tuned} (seed {cfg.seed}, up to {cfg.n_epochs} "
+            f"epochs); results: {run.run_dir}"
         )
         if self.live:
             self._progress = Progress(

@@ -218,8 +218,8 @@ def test_a_flat_configuration_keeps_empty_groups():
 
 
 @pytest.mark.parametrize("env", ["FetchPush", "FetchPush-v1", "FetchPush-v4"])
-def test_tuned_values_apply_to_every_version_with_a_notice(env, caplog):
-    with caplog.at_level(logging.INFO, "scilab_rl"):
+def test_tuned_values_apply_to_every_version(env, caplog):
+    with caplog.at_level(logging.DEBUG, "scilab_rl"):
         cfg = composed("algorithm=sac", f"env={env}")
     tuned = OmegaConf.load(SHIPPED_CONF / "tuned_values/FetchPush/sac.yaml")
     assert cfg.algorithm.arguments["learning_rate"] == tuned.algorithm.learning_rate

@@ -4,9 +4,11 @@ import re
 import subprocess
 import sys
 import textwrap
+from dataclasses import replace
 
 import pytest
 
+from scilab_rl.config.compose import compose
 from scilab_rl.tracking.console import ConsoleTracker, is_interactive
 
 from .conftest import result, run_info
@@ -106,3 +108,9 @@ def test_no_control_characters_for_terminals_that_cannot_redraw(environment):
 
 def test_captured_output_is_not_interactive():
     assert not is_interactive()
+
+
+def test_the_first_line_names_tuned_values(tmp_path, capsys):
+    tuned = compose(["algorithm=sac", "env=FetchPush"])
+    ConsoleTracker().begin(replace(run_info(tmp_path), cfg=tuned))
+    assert "sac learns FetchPush with tuned values (seed" in capsys.readouterr().err

@@ -19,6 +19,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 
 from scilab_rl.algorithms.intrinsic.agents import make_agent_view
 from scilab_rl.algorithms.intrinsic.base import IntrinsicReward
+from scilab_rl.config.workspace import PROJECT_ALGORITHMS
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.learning.values import constructor_parameters
 from scilab_rl.seeding import derive_seed
@@ -61,12 +62,19 @@ def make_intrinsic_reward(
 
 
 def intrinsic_reward_class(name: object) -> type[IntrinsicReward]:
-    """Return the class of a shipped reward, or of a project's own (``custom_algorithms.x.Y``).
+    """Return the class of a shipped reward, or of a project's own.
+
+    Args:
+        name: ``rnd``; ``my_curiosity`` for ``custom_algorithms.my_curiosity.MyCuriosity``, or such
+            a path.
 
     Raises:
         ConfigError: If there is none.
     """
     path = INTRINSIC_REWARDS.get(str(name), name)
+    if isinstance(path, str) and (PROJECT_ALGORITHMS / f"{path}.py").is_file():
+        words = (word.capitalize() for word in path.split("_"))
+        path = f"{_PROJECT}.{path}.{''.join(words)}"
     if isinstance(path, str) and path.startswith((_HERE, f"{_PROJECT}.")):
         module, _, cls_name = path.rpartition(".")
         try:
