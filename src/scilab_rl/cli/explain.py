@@ -17,10 +17,9 @@ from scilab_rl.config.compose import (
     friendly_override,
     initialized_hydra,
     read_yaml,
-    tuned_option,
 )
 from scilab_rl.config.schema import RunConfig, flatten
-from scilab_rl.config.workspace import SHIPPED_CONF, config_files, open_project
+from scilab_rl.config.workspace import SHIPPED_CONF, config_files, open_project, tuned_option
 from scilab_rl.errors import ConfigError, did_you_mean
 
 _LAYER_NAMES = {"tuned_values": "tuned values", "performance": "experiment"}

@@ -1,4 +1,4 @@
-"""``scilab-rl new intrinsic NAME --from PARENT``: create an intrinsic reward from an existing one."""
+"""``scilab-rl new intrinsic NAME --from PARENT``: create an intrinsic reward as a copy."""
 
 from __future__ import annotations
 

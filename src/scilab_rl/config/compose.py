@@ -21,7 +21,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from scilab_rl.config.overrides import as_text, as_texts, tuple_as_list
 from scilab_rl.config.schema import ALIASES, KEYS, STRING, RunConfig, Values, unknown_key
-from scilab_rl.config.workspace import SHIPPED_CONF, config_files
+from scilab_rl.config.workspace import SHIPPED_CONF, config_files, tuned_option
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 
 _log = logging.getLogger(__name__)
@@ -159,16 +159,6 @@ def _readable(name: str, value: str) -> str:
 def _near(path: Path) -> Path:
     """Return a path as seen from here when it is below here."""
     return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
-
-
-def tuned_option(values: Values) -> str | None:
-    """Return the option of the group ``tuned_values`` that fits, such as ``FetchReach/sac``."""
-    env, algorithm = values.get("env"), values.get("algorithm")
-    if not values.get("tuned") or not isinstance(env, str) or not isinstance(algorithm, dict):
-        return None
-    family = re.sub(r"-v\d+$", "", env)
-    option = f"{family}/{algorithm.get('name')}"
-    return option if option in config_files("tuned_values") else None
 
 
 def explain_error(error: Exception) -> ConfigError:

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from scilab_rl.errors import ConfigError
@@ -63,3 +65,13 @@ def config_files(group: str) -> dict[str, Path]:
         for path in sorted(root.rglob("*.yaml")):
             options[path.relative_to(root).with_suffix("").as_posix()] = path
     return options
+
+
+def tuned_option(values: Mapping[str, object]) -> str | None:
+    """Return the option of the group ``tuned_values`` that fits, such as ``FetchReach/sac``."""
+    env, algorithm = values.get("env"), values.get("algorithm")
+    if not values.get("tuned") or not isinstance(env, str) or not isinstance(algorithm, dict):
+        return None
+    family = re.sub(r"-v\d+$", "", env)
+    option = f"{family}/{algorithm.get('name')}"
+    return option if option in config_files("tuned_values") else None

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from scilab_rl.config.compose import tuned_option
+from scilab_rl.config.workspace import tuned_option
 from scilab_rl.results import RunResult
 from scilab_rl.tracking.base import TrackedRun, Tracker
 
