@@ -19,6 +19,7 @@ COLORS = (
 BACKGROUND, FRAME, GRID, INK, FAINT = "#ffffff", "#d4d4d8", "#f1f1f4", "#18181b", "#71717a"
 # Of goals, in every picture; in MuJoCo's scenes, the goal is red too.
 ACHIEVED, DESIRED, REACHED = COLORS[0], COLORS[4], COLORS[2]
+FAILED = COLORS[4]  # of outcomes; REACHED is their other color
 
 
 @functools.cache

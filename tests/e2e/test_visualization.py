@@ -192,7 +192,7 @@ def test_page_shows_the_numbers_of_its_scene(clips: list[Path]) -> None:
     pytest.importorskip("aiohttp")
     with Chromium() as browser:
         for path in clips:
-            browser.open(path.with_suffix(".html").as_uri())
+            browser.open(path.with_suffix(".html").as_uri() + "#0")  # does not play by itself
             browser.wait_for("pictures.every(picture => picture.complete)")
             for step in range(N_STEPS + 1):
                 pixels = np.array(browser.evaluate(_SCENE_PIXELS), np.uint8)
@@ -209,6 +209,26 @@ def test_page_shows_the_numbers_of_its_scene(clips: list[Path]) -> None:
                         assert text == "–", (name, step)
                 assert wanted.keys() <= texts.keys()
                 browser.press("ArrowRight")
+
+
+def test_page_plays_once_and_gives_its_numbers_and_two_are_side_by_side(clips: list[Path]) -> None:
+    if EXECUTABLE is None:
+        pytest.skip("needs chromium")
+    pytest.importorskip("aiohttp")
+    path = clips[0]
+    with Chromium() as browser:
+        browser.open(path.with_suffix(".html").as_uri())
+        browser.wait_for(f"now === {N_STEPS} && timer === null")
+        rows = browser.evaluate("table()").splitlines()
+        assert rows[0].split(",")[:2] == ["episode", "step"]
+        assert len(rows) == N_STEPS + 2
+        assert browser.evaluate("picture().toDataURL().length") > 10_000
+        browser.open(path.with_name("index.html").as_uri())
+        browser.evaluate("document.getElementById('both').click()")
+        steps = "frames.map(frame => frame.contentWindow !== null && !frame.hidden)"
+        assert browser.evaluate(steps) == [True, True]
+        listed = browser.evaluate("known")
+        assert sorted(listed) == sorted(clip.stem for clip in path.parent.glob("*.npz"))
 
 
 def test_live_view_draws_scene_and_curves_in_the_browser() -> None:
@@ -279,7 +299,7 @@ def test_video_draws_the_numbers_of_its_scene(
         assert layout.sheet is not None
         assert len(layout.sheet.panels) == n_panels
         frames = _frames_of(video, layout.size)
-        assert len(frames) == N_STEPS + 1
+        assert len(frames) == N_STEPS + 1 + movie.n_held(clip)
         for frame in frames:
             episode, step = decode_frame(_scene_of(frame, layout))
             wanted = expected(episode, step, clip.info.phase)

@@ -277,7 +277,7 @@ class Agent:
 
         seed = int(self.cfg.seed) + 1 if seed is None else seed
         env, algorithm = load_player(self.cfg, self.policy, record=True) if record else self._player
-        finish = self._film(env, algorithm, metrics) if record else None
+        finish = self._film(env, algorithm, metrics, seed) if record else None
         prepare_torch(self.cfg)
         seed_everything(seed)
         try:
@@ -391,17 +391,22 @@ class Agent:
         return shown.probes[0]
 
     def _film(
-        self, env: VecEnv, algorithm: Algorithm, metrics: Sequence[str] | None
+        self, env: VecEnv, algorithm: Algorithm, metrics: Sequence[str] | None, seed: int
     ) -> Callable[[], Replay]:
         """Prepare the recording of the next episode and return the function that ends it."""
         from scilab_rl.learning.inspector import AgentInspector
         from scilab_rl.recording.callback import film_first_episode
         from scilab_rl.recording.records import FOLDER, SUFFIX, ClipInfo
+        from scilab_rl.training.checkpoint import saved_step
 
         folder = self.run.outputs / FOLDER
         number = len(list(folder.glob(f"play_*{SUFFIX}"))) + 1
-        cfg = self.cfg
-        clip = ClipInfo(f"play_{number:03d}", "eval", 0, cfg.env, cfg.algorithm.name, 0.0, ())
+        cfg, run = self.cfg, str(self.run) if self.run.is_agent else self.run.path.name
+        name, step = self.policy.name.removeprefix("rl_model_"), saved_step(self.policy)
+        policy = name if step is None else f"{name}, after {step:,} steps"
+        clip = ClipInfo(
+            f"play_{number:03d}", "eval", 0, cfg.env, cfg.algorithm.name, 0.0, (), run, seed, policy
+        )
         names = default_metrics(AgentInspector(algorithm)) if metrics is None else metrics
         timeline, recorder = film_first_episode(env, algorithm, names, clip, folder)
 

@@ -278,6 +278,17 @@ def is_known(name: str) -> bool:
     return name in _PROBES or name in _ALIASES
 
 
+def meaning_of(name: str) -> str:
+    """Return in one sentence what a metric means; empty for those of the user.
+
+    >>> meaning_of("q_values"), meaning_of("custom_probes.surprise")
+    ('Q(s, a) of each critic.', '')
+    """
+    if is_known(name):
+        return (inspect.getdoc(_PROBES[_ALIASES.get(name, name)][0]) or "").partition("\n")[0]
+    return "Recorded by the algorithm while it learns." if "/" in name else ""
+
+
 def answerable(inspector: Inspectable) -> list[str]:
     """Return the names of the probes that an algorithm can answer."""
     return [name for name, (_, needs) in _PROBES.items() if needs <= inspector.quantities]

@@ -125,7 +125,7 @@ def record_episodes(
             env,
             inspector,
             metrics,
-            _clip_namer(cfg, env, metrics.names),
+            _clip_namer(cfg, env, metrics.names, folder.name, algorithm),
             sinks,
             frames_per_clip=cfg.render_frames_per_clip,
             logger=logger,
@@ -232,14 +232,17 @@ def _refuse_recorded(
 
 
 def _clip_namer(
-    cfg: RunConfig, env: ObservedVecEnv, panels: tuple[str, ...]
+    cfg: RunConfig, env: ObservedVecEnv, panels: tuple[str, ...], run: str, algorithm: Algorithm
 ) -> Callable[[int, int], ClipInfo]:
     """Return the function that says what the clip of an epoch and episode is about."""
     fps = frames_per_second(env)
 
     def clip(epoch: int, episode: int) -> ClipInfo:
         name = f"{env.phase}_epoch_{epoch:04d}_episode_{episode:05d}"
-        return ClipInfo(name, env.phase, epoch, cfg.env, cfg.algorithm.name, fps, panels)
+        policy = f"after {algorithm.num_timesteps:,} steps"
+        return ClipInfo(
+            name, env.phase, epoch, cfg.env, cfg.algorithm.name, fps, panels, run, cfg.seed, policy
+        )
 
     return clip
 

@@ -13,14 +13,25 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scilab_rl.drawing import BACKGROUND, COLORS, FAINT, FRAME, GRID, INK, font, number_text, ticks
+from scilab_rl.drawing import (
+    BACKGROUND,
+    COLORS,
+    FAILED,
+    FAINT,
+    FRAME,
+    GRID,
+    INK,
+    REACHED,
+    font,
+    number_text,
+    ticks,
+)
 from scilab_rl.recording.records import (
     Clip,
     Record,
     decode_picture,
     picture_size,
     title_of,
-    value_range,
 )
 
 if TYPE_CHECKING:
@@ -36,11 +47,14 @@ _ROWS = 4  # panels in one column, until there are four columns
 _MIN_PANEL_HEIGHT = 112
 NO_VALUE = "-"  # the font has no dash
 _SMOOTH = 2  # everything that does not move is drawn twice as large and scaled down
+_HELD = 1.5  # seconds; the last frame stays, because players start again at once
 _TITLE, _LEFT, _RIGHT, _BOTTOM = 22, 50, 12, 18  # pixels around the curves
 
 
 def write_movie(clip: Clip, path: Path) -> None:
     """Write a clip as mp4, which stays playable when the program is killed.
+
+    It runs in real time, or slower if the clip is short, and ends with a still picture.
 
     Raises:
         OSError: If not all frames are in the file, for example because the disk is full.
@@ -48,16 +62,17 @@ def write_movie(clip: Clip, path: Path) -> None:
     import imageio_ffmpeg
 
     frames = MovieFrames(clip)
+    shown = [*range(len(frames)), *[len(frames) - 1] * n_held(clip)]
     encoder = imageio_ffmpeg.write_frames(
         str(path),
         frames.size,
-        fps=clip.info.fps,
+        fps=clip.shown_rate,
         macro_block_size=_EVEN,
         output_params=["-movflags", "+frag_keyframe+empty_moov", "-crf", "23"],
     )
     encoder.send(None)
     try:
-        for index in range(len(frames)):
+        for index in shown:
             encoder.send(frames[index])
     except OSError as error:  # it holds the whole command, and what ffmpeg has said at its end
         said = str(error).partition("STDERR OUTPUT:")[2].strip().rpartition("\n")[2]
@@ -69,8 +84,13 @@ def write_movie(clip: Clip, path: Path) -> None:
         n_written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the encoder hides failures
     except RuntimeError:  # it cannot even be opened; the message is all that ffmpeg has to say
         n_written = 0
-    if n_written != len(frames):
-        raise OSError(f"{n_written} of {len(frames)} frames could be written; is the disk full?")
+    if n_written != len(shown):
+        raise OSError(f"{n_written} of {len(shown)} frames could be written; is the disk full?")
+
+
+def n_held(clip: Clip) -> int:
+    """Return how many times the last frame of a video is repeated."""
+    return round(_HELD * clip.shown_rate)
 
 
 class MovieFrames:
@@ -110,7 +130,9 @@ class MovieFrames:
         if record.picture:
             scene = self._scene(record)
             left, top = ((self.scene_size[i] - scene.size[i]) // 2 for i in (0, 1))
-            image.paste(scene, (self.scene_corner[0] + left, self.scene_corner[1] + top))
+            corner = (self.scene_corner[0] + left, self.scene_corner[1] + top)
+            image.paste(scene, corner)
+            self._mark_outcome(ImageDraw.Draw(image), index, corner, scene.size)
         if self.sheet is not None:
             image.paste(self.sheet.until(index), (self.scene_size[0], HEADER))
         self._write_header(ImageDraw.Draw(image), record)
@@ -125,6 +147,27 @@ class MovieFrames:
         size = self._scaled(*scene.size)
         return scene if scene.size == size else scene.resize(size, how)
 
+    def _mark_outcome(
+        self, draw: ImageDraw, index: int, corner: tuple[int, int], size: tuple[int, int]
+    ) -> None:
+        """Frame the scenes after which the task is solved, and the last one of a failure."""
+        reached = index > 0 and self.clip.records[index - 1].success
+        if self.clip.records[index].step == 0 or reached is None:
+            return
+        is_end = self.clip.records[index].is_last_scene
+        if not reached and not is_end:
+            return
+        if max(picture_size(self.clip.records[index].picture)) <= _SMALL:
+            return  # nothing may be drawn over a picture of few pixels
+        color, text = (REACHED, "success") if reached else (FAILED, "no success")
+        right, bottom = corner[0] + size[0] - 1, corner[1] + size[1] - 1
+        draw.rectangle((*corner, right, bottom), outline=color, width=3)
+        width = draw.textlength(text, font=font(14))
+        draw.rounded_rectangle(
+            (corner[0] + 12, bottom - 38, corner[0] + 32 + width, bottom - 12), 13, fill=color
+        )
+        draw.text((corner[0] + 22, bottom - 25), text, fill="#ffffff", font=font(14), anchor="lm")
+
     def _scaled(self, width: int, height: int) -> tuple[int, int]:
         return max(1, round(width * self.scale)), max(1, round(height * self.scale))
 
@@ -136,7 +179,9 @@ class MovieFrames:
         draw.text((used + 16, 9), where, fill=FAINT, font=letters)
         events = ", ".join(event for event in record.events if event != "episode start")
         if events and self.size[0] > self.scene_size[0]:
-            draw.text((self.size[0] - 12, 9), events, fill="#dc2626", font=letters, anchor="ra")
+            draw.text(
+                (self.size[0] - 12, 9), events, fill=event_color(events), font=letters, anchor="ra"
+            )
 
 
 def grid(n_panels: int) -> tuple[int, int]:
@@ -190,6 +235,12 @@ class PanelSheet:
         self.size = (columns * width, height)
         self.n = len(clip.records)
         self.breaks = {i for i in range(1, self.n) if clip.records[i].step == 0}
+        self.events = [
+            (index, event)
+            for index, record in enumerate(clip.records)
+            for event in record.events
+            if event != "episode start"
+        ]
         self.panels = [
             self._place(clip, name, index, rows, width) for index, name in enumerate(names)
         ]
@@ -215,7 +266,7 @@ class PanelSheet:
         column, row = divmod(index, rows)
         height = self.size[1] / rows
         curves = clip.curves(name)
-        low, high = value_range(list(curves.values()))
+        low, high = clip.range(name)
         return _Panel(
             name,
             curves,
@@ -239,6 +290,7 @@ class PanelSheet:
         for panel in self.panels:
             self._draw_axes(draw, panel)
             if with_curves:
+                self._draw_events(draw, panel)
                 self._draw_curves(draw, panel)
         return np.asarray(image.resize(self.size, Image.Resampling.LANCZOS))
 
@@ -266,6 +318,18 @@ class PanelSheet:
             draw.line([big(x, panel.top), big(x, panel.bottom)], fill=FRAME, width=_SMOOTH)
         corner = [big(panel.left, panel.top), big(panel.left, panel.bottom)]
         draw.line([*corner, big(panel.right, panel.bottom)], fill=FRAME, width=_SMOOTH)
+
+    def _draw_events(self, draw: ImageDraw, panel: _Panel) -> None:
+        """Draw a line at each event through all panels; those on top name it."""
+        for index, event in self.events:
+            x, color = self._x(panel, index), event_color(event)
+            ends = [_big(x, panel.top), _big(x, panel.bottom)]
+            draw.line(ends, fill=_faded(color), width=_SMOOTH)
+            if panel.top == _TITLE:
+                is_late = x > (panel.left + panel.right) / 2
+                where = _big(x - 3 if is_late else x + 3, panel.top + 2)
+                letters, anchor = font(10 * _SMOOTH), "rt" if is_late else "lt"
+                draw.text(where, event, fill=color, font=letters, anchor=anchor)
 
     def _draw_curves(self, draw: ImageDraw, panel: _Panel) -> None:
         for number, curve in enumerate(panel.curves.values()):
@@ -318,6 +382,15 @@ class PanelSheet:
         where = (right, panel.top - _TITLE / 2 - 1)
         draw.text(where, text, fill=color, font=letters, anchor="rm")
         return int(right - width - 10)
+
+
+def event_color(event: str) -> str:
+    """Return the color of an event: green for success, red for what went wrong."""
+    return REACHED if event == "success" else FAILED
+
+
+def _faded(color: str) -> str:
+    return "#" + "".join(f"{(int(color[i : i + 2], 16) + 255) // 2:02x}" for i in (1, 3, 5))
 
 
 def _big(x: float, y: float) -> tuple[float, float]:

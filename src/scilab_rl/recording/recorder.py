@@ -19,7 +19,7 @@ from pathlib import Path
 
 from scilab_rl.recording.movie import write_movie
 from scilab_rl.recording.records import SUFFIX, Clip, ClipInfo, Record, load_clip, save_clip
-from scilab_rl.recording.replay import write_replay
+from scilab_rl.recording.replay import write_index, write_replay
 from scilab_rl.recording.viewer_stream import write_viewer_file
 
 _log = logging.getLogger(__name__)
@@ -148,6 +148,11 @@ def main(arguments: Sequence[str]) -> int:
             except Exception as error:  # noqa: BLE001 - the other files can still be made
                 path.unlink(missing_ok=True)  # a part of it would look like the whole
                 failures.append(f"{suffix} could not be written: {error}")
+    for folder in {Path(name).parent for name in arguments}:
+        try:
+            write_index(folder)
+        except OSError as error:
+            failures.append(f"the list of episodes could not be written: {error}")
     sys.stderr.write("; ".join(" ".join(failure.split()) for failure in failures))
     return int(bool(failures))
 

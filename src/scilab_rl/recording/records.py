@@ -12,12 +12,13 @@ are made from it, and new questions are put to it later (`scilab-rl probe`).
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from scilab_rl import files
+from scilab_rl.drawing import number_text
 from scilab_rl.errors import ConfigError
 from scilab_rl.metrics.probes import Curve, Observation
 
@@ -36,6 +38,10 @@ _NUMBERS = ("env", "episode", "step", "total_steps")
 _FLAGS = ("terminated", "truncated")
 # Rewards, values and distances are in the task's own units.
 _UNITS = {"entropy": "nats", "log_prob": "nats"}
+_WORDS = {"q_values": "critic", "action": "dimension"}  # what the numbers of a panel count
+_RANGES = {"success": (0.0, 1.0)}
+_SHOWN_SECONDS = 5.0  # at least, so that a short episode can be followed
+_SLOWEST = 10.0  # frames per second
 _JPEG_QUALITY = 88
 _FLAT = 5e-3  # smaller relative changes are drawn as none: four digits could not tell them apart
 _SMALL_SIDE = 200  # pixels; small frames cost little without loss
@@ -97,6 +103,9 @@ class ClipInfo:
         algorithm: Name of the algorithm.
         fps: Frames per second of the task.
         panels: Names of the metrics, one panel each.
+        run: Name of the run.
+        seed: Of its environment; None where it is not known.
+        policy: Which policy acts.
     """
 
     name: str
@@ -106,11 +115,43 @@ class ClipInfo:
     algorithm: str
     fps: float
     panels: tuple[str, ...]
+    run: str = ""
+    seed: int | None = None
+    policy: str = ""
 
     def place(self, episode: int) -> str:
         """Return where an episode of the clip belongs, as it is written next to its scenes."""
         phase = {"train": "training", "eval": "evaluation"}.get(self.phase, self.phase)
-        return f"{phase}, epoch {self.epoch}, episode {episode}"
+        epoch = f", epoch {self.epoch}" if self.epoch else ""  # a played policy has none
+        return f"{phase}{epoch}, episode {episode}"
+
+
+@dataclass(frozen=True)
+class EpisodeOutcome:
+    """How an episode of a clip went.
+
+    Attributes:
+        total_reward: The sum of its rewards.
+        n_steps: Its length.
+        success: Whether it ended in success; None where the task has no such notion.
+        is_complete: Whether the clip holds it from its first to its last scene.
+    """
+
+    total_reward: float
+    n_steps: int
+    success: bool | None
+    is_complete: bool
+
+    def text(self) -> str:
+        """Return the outcome as it is written next to the scene.
+
+        >>> EpisodeOutcome(-12.0, 50, True, True).text()
+        'success, return -12, 50 steps'
+        """
+        if not self.is_complete:
+            return "part of an episode"
+        word = {None: "", True: "success, ", False: "no success, "}[self.success]
+        return f"{word}return {number_text(self.total_reward)}, {self.n_steps} steps"
 
 
 @dataclass
@@ -127,10 +168,77 @@ class Clip:
         """
         curves = {curve for record in self.records for curve in record.values}
         return {
-            curve.label: [record.values.get(curve) for record in self.records]
+            label_of(curve): [record.values.get(curve) for record in self.records]
             for curve in sorted(curves, key=lambda curve: _natural(curve.label))
             if curve.panel == panel
         }
+
+    def range(self, panel: str) -> tuple[float, float]:
+        """Return the range of a panel's axis, the same for all its scenes."""
+        return _RANGES.get(panel) or value_range(list(self.curves(panel).values()))
+
+    @property
+    def shown_rate(self) -> float:
+        """Frames per second at which it is shown: real time, or slower if it is short.
+
+        50 steps of a robot take two seconds, in which nobody sees what happens.
+        """
+        wanted = (len(self.records) - 1) / _SHOWN_SECONDS
+        return min(self.info.fps, max(_SLOWEST, wanted))
+
+    def outcomes(self) -> dict[int, EpisodeOutcome]:
+        """Return how each episode went, by its number."""
+        return _outcomes(
+            [record.episode for record in self.records],
+            [record.step for record in self.records],
+            [record.reward for record in self.records],
+            [record.success for record in self.records],
+        )
+
+
+def read_outcomes(path: Path) -> tuple[ClipInfo, dict[int, EpisodeOutcome]]:
+    """Return what a clip is about and how its episodes went, without reading its pictures.
+
+    Raises:
+        ConfigError: If the file is not a recorded episode.
+    """
+    with _opened(path) as stored:
+        rewards = [None if math.isnan(reward) else reward for reward in stored["reward"].tolist()]
+        successes = [None if s == _UNKNOWN else bool(s) for s in stored["success"].tolist()]
+        places = stored["episode"].tolist(), stored["step"].tolist()
+        return _info(stored), _outcomes(*places, rewards, successes)
+
+
+def _outcomes(
+    episodes: Sequence[int],
+    steps: Sequence[int],
+    rewards: Sequence[float | None],
+    successes: Sequence[bool | None],
+) -> dict[int, EpisodeOutcome]:
+    outcomes = {}
+    for episode in dict.fromkeys(episodes):
+        places = [place for place, number in enumerate(episodes) if number == episode]
+        known = [rewards[place] for place in places if rewards[place] is not None]
+        last = [successes[place] for place in places if rewards[place] is not None]
+        outcomes[episode] = EpisodeOutcome(
+            math.fsum(reward for reward in known if reward is not None),
+            len(known),
+            last[-1] if last else None,
+            steps[places[0]] == 0 and rewards[places[-1]] is None,
+        )
+    return outcomes
+
+
+def label_of(curve: Curve) -> str:
+    """Return what the legend says of a curve; numbers of critics are counted from 1.
+
+    >>> label_of(Curve("q_values", "0")), label_of(Curve("q_values", "best 1"))
+    ('critic 1', 'best critic 2')
+    """
+    word = _WORDS.get(curve.panel, "")
+    return (
+        re.sub(r"\d+$", lambda n: f"{word} {int(n[0]) + 1}", curve.label) if word else curve.label
+    )
 
 
 def title_of(panel: str) -> str:
@@ -173,17 +281,25 @@ def picture_size(picture: bytes) -> tuple[int, int]:
 def value_range(curves: Sequence[Sequence[float | None]]) -> tuple[float, float]:
     """Return the range of an axis that holds all values, with some room.
 
-    >>> value_range([[None]])
-    (0.0, 1.0)
+    It does not go beyond 0 where no value does: a variance is never negative. Values that hardly
+    change are drawn on an axis from 0, because their differences mean nothing.
+
+    >>> value_range([[None]]), value_range([[-1.0, -1.0]]), value_range([[0.0, 10.0]])
+    ((0.0, 1.0), (-1.25, 0.0), (0.0, 10.6))
     """
     numbers = [number for curve in curves for number in curve if number is not None]
     if not numbers:
         return 0.0, 1.0
     low, high = min(numbers), max(numbers)
+    largest = max(abs(low), abs(high))
+    if not largest:
+        return 0.0, 1.0
+    if high - low < _FLAT * largest:
+        return (0.0, 1.25 * high) if low > 0 else (1.25 * low, 0.0)
     room = 0.06 * (high - low)
-    if high - low < _FLAT * max(abs(low), abs(high)) or high == low:
-        room = max(0.1 * abs(high), 1e-9) if high else 0.5
-    return low - room, high + room
+    return (max(low - room, 0.0) if low >= 0 else low - room), (
+        min(high + room, 0.0) if high <= 0 else high + room
+    )
 
 
 def _natural(label: str) -> list[tuple[int, str]]:
@@ -209,9 +325,15 @@ def load_clip(path: Path) -> Clip:
     Raises:
         ConfigError: If the file is not a recorded episode.
     """
+    with _opened(path) as stored:
+        return _clip({name: stored[name] for name in stored.files})
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[np.lib.npyio.NpzFile]:
     try:
         with np.load(path, allow_pickle=False) as stored:
-            return _clip({name: stored[name] for name in stored.files})
+            yield stored
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(f"'{path}' is not a recorded episode: {error}") from error
 
@@ -256,10 +378,7 @@ def _actions(records: list[Record]) -> np.ndarray:
 
 def _clip(arrays: dict[str, np.ndarray]) -> Clip:
     about = json.loads(str(arrays["about"]))
-    if about["format"] != _FORMAT:
-        raise ValueError(f"its format is {about['format']}, and this version reads {_FORMAT}")
-    info = about["info"]
-    clip = Clip(ClipInfo(**info | {"panels": tuple(info["panels"])}))
+    clip = Clip(_info(arrays))
     data = arrays["picture"].tobytes()
     for index, end in enumerate(arrays["picture_ends"]):
         start = int(arrays["picture_ends"][index - 1]) if index else 0
@@ -269,6 +388,14 @@ def _clip(arrays: dict[str, np.ndarray]) -> Clip:
         record.values = {Curve(*curve): n for curve, n in numbers if not math.isnan(n)}
         clip.records.append(record)
     return clip
+
+
+def _info(arrays: Mapping[str, np.ndarray]) -> ClipInfo:
+    about = json.loads(str(arrays["about"]))
+    if about["format"] != _FORMAT:
+        raise ValueError(f"its format is {about['format']}, and this version reads {_FORMAT}")
+    info = about["info"]
+    return ClipInfo(**info | {"panels": tuple(info["panels"])})
 
 
 def _record(arrays: dict[str, np.ndarray], index: int, picture: bytes) -> Record:

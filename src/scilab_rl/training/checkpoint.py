@@ -78,6 +78,15 @@ def load(directory: Path) -> Snapshot:
         raise CheckpointError(f"'{directory}' cannot be read: {error}") from error
 
 
+def saved_step(directory: Path) -> int | None:
+    """Return after how many environment steps something was saved; None where it is not known."""
+    try:
+        manifest = json.loads((directory / MANIFEST).read_text(encoding="utf-8"))
+        return int(manifest["step"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return None
+
+
 def verify(directory: Path) -> dict[str, Any]:
     """Return the manifest of a saved directory after comparing every file with it.
 

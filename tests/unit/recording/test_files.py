@@ -15,17 +15,19 @@ from scilab_rl.errors import ConfigError
 from scilab_rl.metrics.probes import Curve
 from scilab_rl.metrics.triggers import parse_trigger
 from scilab_rl.recording.highlights import HighlightRecorder
-from scilab_rl.recording.movie import MovieFrames
+from scilab_rl.recording.movie import MovieFrames, n_held
 from scilab_rl.recording.recorder import ClipRecorder, render_clip_files
 from scilab_rl.recording.records import (
+    EpisodeOutcome,
     Record,
     decode_picture,
     encode_picture,
     load_clip,
+    read_outcomes,
     save_clip,
     value_range,
 )
-from scilab_rl.recording.replay import write_replay
+from scilab_rl.recording.replay import write_index, write_replay
 from scilab_rl.testing import decode_frame
 
 from .clips import make_clip
@@ -79,6 +81,8 @@ def test_page_is_one_file_whose_data_cannot_end_it(tmp_path: Path) -> None:
     assert data["steps"] == [0, 1, 2, 3, 4]
     assert data["panels"][1]["curves"] == [{"label": "", "values": [0.0, None, 2.0, 3.0, None]}]
     assert data["events"][3] == ["success"]
+    assert data["outcomes"] == {"3": {"success": True, "return": 6.0, "steps": 4, "complete": True}}
+    assert data["rate"] == 10.0  # an episode of four steps is shown slower than in real time
 
 
 @pytest.mark.parametrize("n_panels", range(17))
@@ -123,8 +127,42 @@ def test_curves_are_drawn_only_up_to_the_scene() -> None:
 
 def test_ranges_are_those_of_the_whole_clip() -> None:
     assert value_range([[0.0, 10.0], [None, -10.0]]) == pytest.approx((-11.2, 11.2))
-    low, high = value_range([[5.0, 5.0]])
-    assert low < 5.0 < high
+    assert value_range([[5.0, 5.001]]) == pytest.approx((0.0, 6.25125))
+    assert value_range([[0.0, 2e-6], [1e-6, None]])[0] == 0.0  # no variance is negative
+    assert make_clip(("success",)).range("success") == (0.0, 1.0)
+
+
+def test_critics_have_names_and_other_numbers_have_theirs() -> None:
+    assert list(make_clip().curves("q_values")) == ["critic 1", "critic 2"]
+    clip = make_clip(("custom.x",))
+    clip.records[0].values = {Curve("custom.x", "arm 0"): 1.0}
+    assert list(clip.curves("custom.x")) == ["arm 0"]
+
+
+def test_outcomes_are_read_without_the_pictures(tmp_path: Path) -> None:
+    clip = make_clip()
+    save_clip(clip, tmp_path / "x.npz")
+    info, outcomes = read_outcomes(tmp_path / "x.npz")
+    assert info == clip.info
+    assert outcomes == clip.outcomes() == {3: EpisodeOutcome(6.0, 4, True, True)}
+    clip.records = clip.records[2:]
+    assert clip.outcomes() == {3: EpisodeOutcome(5.0, 2, True, False)}
+    assert clip.outcomes()[3].text() == "part of an episode"
+
+
+def test_the_index_lists_all_pages_of_a_folder(tmp_path: Path) -> None:
+    for name in ("eval_epoch_0001_episode_00003", "play_001"):
+        clip = make_clip()
+        save_clip(clip, tmp_path / f"{name}.npz")
+        (tmp_path / f"{name}.html").write_text("")
+    save_clip(make_clip(), tmp_path / "without_page.npz")
+    (tmp_path / "broken.npz").write_bytes(b"no zip")
+    (tmp_path / "broken.html").write_text("")
+    text = write_index(tmp_path).read_text(encoding="utf-8")
+    assert re.findall(r'<option value="(.*?)">(.*?)</option>', text) == [
+        ("eval_epoch_0001_episode_00003", "epoch 1, episode 3: success, return 6, 4 steps"),
+        ("play_001", "play 001: success, return 6, 4 steps"),
+    ]
 
 
 @pytest.fixture(scope="module")
@@ -135,11 +173,12 @@ def developed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_video_has_one_frame_per_scene_and_plays(developed: Path) -> None:
+def test_video_has_one_frame_per_scene_and_holds_the_last(developed: Path) -> None:
     import imageio_ffmpeg
 
     n_frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(developed.with_suffix(".mp4")))
-    assert (n_frames, seconds) == (5, pytest.approx(0.2, abs=0.05))
+    assert n_held(load_clip(developed)) == 15
+    assert (n_frames, seconds) == (20, pytest.approx(2.0, abs=0.1))
 
 
 def test_picture_of_a_large_frame_survives_jpeg() -> None:
@@ -226,6 +265,15 @@ def test_the_font_has_what_panels_write() -> None:
     missing = bytes(font.getmask("\ue123"))  # of a letter that no font has
     written = {*"0123456789.e+…:", *NO_VALUE}
     assert [letter for letter in written if bytes(font.getmask(letter)) == missing] == []
+
+
+def test_success_is_marked_in_the_scenes_that_follow_it() -> None:
+    green = (5, 150, 105)
+    clip = make_clip(large=True)
+    frames = MovieFrames(clip)
+    left, top = frames.scene_corner
+    edges = [tuple(frames[index][top + 1, left + 40]) for index in range(5)]
+    assert [edge == green for edge in edges] == [False, False, False, False, True]
 
 
 def without_pictures(clip, steps):

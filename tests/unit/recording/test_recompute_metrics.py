@@ -70,7 +70,8 @@ def test_other_checkpoints_add_a_curve_each() -> None:
     )
     assert clip.info.panels == (*PROBES, "entropy")
     assert set(clip.curves("entropy")) == {"best", "finished"}
-    labels = {"0", "1", "best 0", "best 1", "finished 0", "finished 1"}
+    critics = ("critic 1", "critic 2")
+    labels = {f"{policy}{critic}" for policy in ("", "best ", "finished ") for critic in critics}
     curves = clip.curves("q_values")
     assert set(curves) == labels
     assert len({np.round(curves[label][0] or 0.0, 8) for label in labels}) == len(labels)
