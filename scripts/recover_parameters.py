@@ -84,7 +84,7 @@ def main() -> None:
     for seed, (beta, number) in enumerate(participants, start=1):
         table = options.folder / f"participant_{beta:g}_{number}.csv"
         scilab_rl(
-            "export", "last", "--trials", "--policy=best", f"--softmax={beta}",
+            "export", "last", "--trials", "--saved=best", f"--softmax={beta}",
             f"--episodes={options.episodes}", f"--seed={seed}", f"--output={table}",
             f"--base-logdir={options.folder}",
         )  # fmt: skip

@@ -80,7 +80,8 @@ def discard(directory: Path) -> None:
     It is renamed first, so that one that is half removed cannot be taken for a whole one; what a
     process leaves that is killed meanwhile, `remove_unfinished` removes.
     """
-    doomed = directory.with_name(f".{directory.name}.{os.getpid()}.tmp")
+    # Not the name under which its successor is being written.
+    doomed = directory.with_name(f".{directory.name}.{os.getpid()}.old.tmp")
     with contextlib.suppress(OSError):
         directory.rename(doomed)
         fault_point("files.in_discarding")

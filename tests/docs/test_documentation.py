@@ -175,13 +175,18 @@ def type_command(command: str, more: dict[str, str], place: str, *, fails: bool 
         arguments = shortened(words[2 if words[0] == "python" else 1 :], more)
         forget_desk()  # a reader starts a new process
         code = run_command_line(arguments)
-    elif words[:3] == ["python", "-m", "pytest"] or words[0] == "git":
+    elif words[:3] == ["python", "-m", "pytest"] or words[0] == "git" or is_script(words):
         words = [sys.executable, *words[1:]] if words[0] == "python" else words
         done = subprocess.run(words, env=quiet_environment(), capture_output=True, check=False)
         code = done.returncode if words[0] != "git" else int(done.returncode > 1)
     else:
         pytest.fail(f"{place}: '{command}' cannot be tested; say why with a comment")
     assert (code != 0) == fails, f"{place}: exit code {code} of {' '.join(words)}"
+
+
+def is_script(words: list[str]) -> bool:
+    """Return whether a command runs a file that the page has made."""
+    return words[0] == "python" and Path(words[1]).is_file()
 
 
 def shortened(arguments: list[str], more: dict[str, str]) -> list[str]:

@@ -1,4 +1,4 @@
-"""``scilab-rl export RUN``: a tidy table for statistics, or with ``--agent`` a trained agent."""
+"""``scilab-rl export RUN``: a table for statistics, a trained agent, or a policy for a robot."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from scilab_rl.config.workspace import PROJECT_AGENTS, open_project
 from scilab_rl.errors import ConfigError
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run
 
+SAVED = ("best", "finished")
 _log = logging.getLogger(__name__)
 
 
@@ -27,6 +28,8 @@ def main(arguments: list[str]) -> int:
     run = find_run(options.run, options.base_logdir)
     if options.agent:
         return _agent(run, options)
+    if options.policy:
+        return _policy(run, options)
     cfg = load_recorded(run / CONFIG_FILE)
     rows = _training_episodes(run) if options.training else _trials(run, cfg, options)
     origin = {
@@ -50,7 +53,7 @@ def _agent(run: RunDirectory, options: argparse.Namespace) -> int:
     from scilab_rl.acceptance.agents import PAGE_FILE, write_agent
 
     run.refuse_agent()
-    policy = find_policy(run, options.run, options.policy)
+    policy = find_policy(run, options.run, options.saved)
     folder = write_agent(
         run,
         policy,
@@ -63,12 +66,36 @@ def _agent(run: RunDirectory, options: argparse.Namespace) -> int:
     return 0
 
 
+def _policy(run: RunDirectory, options: argparse.Namespace) -> int:
+    """Write a policy for a robot, and say how exactly it acts as the agent."""
+    if str(options.policy) in SAVED:
+        raise ConfigError(
+            f"--policy is the folder to write to; the saved policy is --saved {options.policy}."
+        )
+    from scilab_rl.deployment.export import write_policy
+    from scilab_rl.tracking.console import print_table
+
+    saved = find_policy(run, options.run, options.saved)
+    report = write_policy(run, saved, options.policy)
+    onnx = report["onnx"]
+    print_table(
+        [
+            ("policy", str(options.policy)),
+            ("compared in", f"{report['observations']:,} observations"),
+            ("largest difference, NumPy", f"{report['numpy']:.1e}"),
+            ("largest difference, ONNX", "not measured" if onnx is None else f"{onnx:.1e}"),
+            ("an answer takes", f"{report['milliseconds']:.3f} ms"),
+        ]
+    )
+    return 0
+
+
 def _trials(
     run: RunDirectory, cfg: RunConfig, options: argparse.Namespace
 ) -> Sequence[Mapping[str, object]]:
     from scilab_rl.api.agent import Agent
 
-    policy = find_policy(run, options.run, options.policy, "best", "finished")
+    policy = find_policy(run, options.run, options.saved, "best", "finished")
     with Agent(run, cfg, policy) as agent:
         return agent.trajectories(
             options.episodes or 20,
@@ -94,8 +121,9 @@ def _training_episodes(run: RunDirectory) -> Sequence[Mapping[str, object]]:
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = CommandParser(
         "export",
-        "Write the observations, actions and metrics of an agent as a tidy table, or keep the "
-        "agent itself under a name, with a card that says how good it is.",
+        "Write the observations, actions and metrics of an agent as a tidy table, keep the agent "
+        "itself under a name, with a card that says how good it is, or write its policy for a "
+        "robot.",
         run=True,
         base=True,
     )
@@ -106,13 +134,19 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     )
     what.add_argument("--training", action="store_true", help="the recorded training episodes")
     what.add_argument(
+        "--policy",
+        type=Path,
+        metavar="DIR",
+        help="the policy for a robot, as NumPy arrays and ONNX, with a runtime and a contract",
+    )
+    what.add_argument(
         "--agent",
         metavar="NAME",
         help="keep the policy as agent:NAME, and measure it: agents/NAME/README.md",
     )
     add("--per", choices=("step", "episode"), default="step", help="what a row is; default: a step")
     add("--episodes", type=positive, help="default: 20; of an agent: 1000, over 5 seeds")
-    add("--policy", choices=("best", "finished"), default="finished")
+    add("--saved", choices=SAVED, default="finished", help="which policy; default: finished")
     add(
         "--softmax",
         type=float,

@@ -38,6 +38,15 @@ class FetchTask(MujocoGoalEnv):
         start: Where it is at the start of an episode. Shapes: ``(3,)`` in m.
     """
 
+    metadata = {  # noqa: RUF012 - Gymnasium's
+        **MujocoGoalEnv.metadata,
+        "units": {
+            "observation": "positions in m, Euler angles in rad, velocities in m or rad per step",
+            "achieved_goal": "m",
+            "desired_goal": "m",
+            "action": f"{STEP_LENGTH} m per axis and step; fingers: 1 opens, -1 closes",
+        },
+    }
     action_size = 4
     fingers_closed: bool = False
     start_height: float = 0.535

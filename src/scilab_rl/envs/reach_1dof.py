@@ -20,6 +20,15 @@ class Reach1DOF(FetchTask):
         kwargs: Those of `GoalEnv`: reward_type (sparse | dense), threshold, ...
     """
 
+    metadata = {  # noqa: RUF012 - Gymnasium's
+        **FetchTask.metadata,
+        "units": {
+            "observation": "m, m per step",
+            "achieved_goal": "m",
+            "desired_goal": "m",
+            "action": f"{STEP_LENGTH} m of the gripper along x per step",
+        },
+    }
     action_size = 1
     fingers_closed = True
     goal_range = 0.15

@@ -73,7 +73,7 @@ class AgentInspector:
         self.algorithm = algorithm
         self._normalization = unwrap_vec_normalize(algorithm.get_env())
         self._actions, _ = conversions(algorithm.get_env())
-        self._functions = _observation_functions(algorithm.get_env())
+        self._functions = observation_functions(algorithm.get_env())
         self.reason = why_not_asked(algorithm.get_env())
         self._ask = {} if self.reason else _methods(algorithm)
         self._memory = None if self.reason else _memory_of(algorithm)
@@ -230,7 +230,7 @@ def _layers(env: VecEnv | None) -> Iterator[VecEnvWrapper]:
         env = env.venv
 
 
-def _observation_functions(env: VecEnv | None) -> list[Callable[[Observation], Observation]]:
+def observation_functions(env: VecEnv | None) -> list[Callable[[Observation], Observation]]:
     """Return what turns the environment's observations into the algorithm's, in order."""
     return [
         make(layer)

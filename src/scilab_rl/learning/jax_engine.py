@@ -27,7 +27,6 @@ Array = jax.Array | np.ndarray
 
 Params = list[dict[str, Array]]  # one entry per layer, input first
 State = dict[str, Any]
-_NORMALIZED_LIMIT = 5.0
 
 _log = logging.getLogger(__name__)
 
@@ -118,12 +117,19 @@ class Normalizer:
         n_flags: So many numbers at its end stay as they are.
     """
 
+    limit = 5.0
+
     def __init__(self, n_observations: int, *, active: bool, n_flags: int = 0) -> None:
         self.active = active
         self.count = 0
         self.n_normalized = n_observations - n_flags
         self.mean = np.zeros(self.n_normalized)
         self.squares = np.zeros(self.n_normalized)  # sum of squared deviations from the mean
+
+    @property
+    def scale(self) -> np.ndarray:
+        """What deviations are divided by: at least 0.01, so that constant dimensions stay small."""
+        return np.maximum(np.sqrt(self.squares / max(self.count, 1)), 1e-2)
 
     def update(self, vectors: np.ndarray) -> None:
         """Take observations into account. Shapes: ``(batch, n_observations)``."""
@@ -145,10 +151,9 @@ class Normalizer:
         """
         if not self.active:
             return vectors
-        scale = np.sqrt(self.squares / max(self.count, 1))
         values, flags = np.split(vectors, [self.n_normalized], axis=-1)
-        normal = (values - self.mean) / np.maximum(scale, 1e-2)  # constant dimensions stay small
-        normal = normal.clip(-_NORMALIZED_LIMIT, _NORMALIZED_LIMIT).astype(np.float32)
+        normal = (values - self.mean) / self.scale
+        normal = normal.clip(-self.limit, self.limit).astype(np.float32)
         return np.concatenate([normal, flags], axis=-1) if flags.shape[-1] else normal
 
 

@@ -65,6 +65,16 @@ def fingerprint_of(env: gym.Env) -> str | None:
         return None
 
 
+def recorded_fingerprint(run: RunDirectory) -> str | None:
+    """Return the fingerprint that a run or a trained agent has recorded, if it has."""
+    for name in (PROVENANCE_FILE, "card.json"):
+        try:
+            return json.loads((run / name).read_text(encoding="utf-8"))["fingerprint"]
+        except (OSError, ValueError, TypeError, KeyError):
+            continue
+    return None
+
+
 def fingerprint_differences(runs: Iterable[RunDirectory]) -> list[str]:
     """Return which environments differ between runs that are compared.
 

@@ -80,6 +80,13 @@ def test_measuring_again_gives_the_same_and_failed_goals_are_where_they_were(age
         assert failures["goals"]["all"]["low"][dimension] <= low <= mean <= high <= 1
 
 
+def test_an_older_agent_of_the_name_is_replaced(agent, tmp_path):
+    (agent / "older.txt").write_text("")
+    assert run_command_line(["export", "last", "--agent", "Tiny", "--episodes", "5"]) == 0
+    assert read_card(agent)["evaluation"]["episodes"] == 5
+    assert not (agent / "older.txt").exists() and len(list((tmp_path / "agents").iterdir())) == 1
+
+
 def test_nothing_of_this_machine_is_kept(agent, tmp_path):
     for name, content in files_of(agent).items():
         if name.suffix in (".json", ".jsonl", ".yaml", ".md"):
