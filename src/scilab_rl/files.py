@@ -132,7 +132,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def fsync_directory(directory: Path) -> None:
-    """Make a rename in this directory survive a power cut."""
+    """Make a rename in this directory survive a power failure."""
     descriptor = os.open(directory, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -119,7 +119,7 @@ class CoppeliaDrive(CoppeliaSimEnv):
         self._marker = self.create_shape("spheroid", (0.08, 0.08, 0.08), _RED)
 
     def place_objects(self) -> None:
-        """Put the robot beside the pillar, in any direction."""
+        """Put the robot next to the pillar, in any direction."""
         heading = self.np_random.uniform(-np.pi, np.pi)
         self._move(np.array([*self._free_place(), heading]))
 

@@ -13,7 +13,7 @@ from scilab_rl.errors import NumericalError
 def check_finite(
     name: str, values: Tensor | Sequence[float], update: int, **hyperparameters: object
 ) -> None:
-    """Stop learning when a number is no longer one.
+    """Stop learning when a number is not finite any more.
 
     Args:
         name: What it is, for example ``critic_loss``.

@@ -1,4 +1,4 @@
-"""A note and tags that a person gives a run later, in a small file beside its own."""
+"""A note and tags that a person gives a run later, in a small file of the run."""
 
 from __future__ import annotations
 

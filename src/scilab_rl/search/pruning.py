@@ -1,4 +1,4 @@
-"""Stopping hopeless runs early, by Optuna's pruners.
+"""Stopping weak runs early, by Optuna's pruners.
 
 A run is compared with the runs of other configurations *with the same seed*, epoch by epoch, so
 that a lucky seed does not prune an unlucky one. Optuna's own trials are whole configurations here,
@@ -43,7 +43,7 @@ def make_pruner(name: str, warmup_epochs: int, n_epochs: int) -> optuna.pruners.
 
 
 class Pruning:
-    """Tells which running runs are hopeless.
+    """Tells which running runs are weak.
 
     Args:
         name: The pruner.
@@ -69,7 +69,7 @@ class Pruning:
                 self._finished.add(run.identity)
                 self._finish(run)
 
-    def is_hopeless(self, run: Run, epoch: int, value: float) -> bool:
+    def is_weak(self, run: Run, epoch: int, value: float) -> bool:
         """Hear of an evaluation of a run and return whether the run must stop.
 
         Args:
@@ -92,7 +92,7 @@ class Pruning:
         by_rungs = isinstance(self.pruner, optuna.pruners.HyperbandPruner)  # it marks what it saw
         if by_rungs or run.identity in self._trials:
             for epoch, value in enumerate(run.values, start=1):
-                self.is_hopeless(run, epoch, value)
+                self.is_weak(run, epoch, value)
             self._study(run).tell(self._trials[run.identity], run.values[-1])
         elif not math.isnan(run.values[-1]):
             curve = dict(enumerate(run.values, start=1))

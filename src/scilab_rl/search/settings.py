@@ -36,7 +36,7 @@ class StudySettings:
         sampler: Name of the sampler.
         seed: Seed of the study; 0 draws one.
         score: Name of the score, or one per objective.
-        pruner: What stops hopeless runs.
+        pruner: What stops weak runs.
         pruner_warmup_epochs: Evaluations of each run before it may be pruned; None means a third.
         trial_timeout: Seconds after which a run is killed and has failed; None means never.
         max_retries: How often a run is repeated that the machine has ended.

@@ -269,9 +269,9 @@ class Study:
         epoch, value = content["epoch"], content["value"]
         if run.is_final:
             return True
-        hopeless = self.pruning.is_hopeless(run, epoch, value)
+        weak = self.pruning.is_weak(run, epoch, value)
         others = self.storage.history.by_trial[run.trial].values()
-        return not (hopeless or any(other.state in (PRUNED, FAILED) for other in others))
+        return not (weak or any(other.state in (PRUNED, FAILED) for other in others))
 
     def _outcome(self, run: Run, content: Mapping[str, Any]) -> Run:
         run = run.with_(

@@ -1,4 +1,4 @@
-"""Intrinsic curiosity module (ICM): rewarded for consequences that could not be foretold.
+"""Intrinsic curiosity module (ICM): rewarded for consequences that could not be predicted.
 
 Pathak et al., 2017, "Curiosity-driven Exploration by Self-supervised Prediction", arXiv 1705.05363.
 Features phi of the state are learned so that the action can be told from them, and so leave out
