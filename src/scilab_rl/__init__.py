@@ -4,6 +4,7 @@
 
     import scilab_rl
 
+    run = scilab_rl.train(env="FetchReach", algorithm="cleansac", n_epochs=5, seed=1)
     agent = scilab_rl.load("agent:FetchPush")
     env = agent.make_env(render_mode="rgb_array")
     observation, _ = env.reset(seed=0)
@@ -21,19 +22,27 @@ from scilab_rl.envs.on_import import register_when_imported
 TYPE_CHECKING = False  # that of `typing`, whose import would take longer than all the rest
 if TYPE_CHECKING:
     from scilab_rl.api.agent import Agent, EvaluationSummary, load
+    from scilab_rl.api.comparison import ComparisonSummary, compare
+    from scilab_rl.api.run import Run, runs, train
     from scilab_rl.errors import ConfigError, ScilabRLError
 
 __version__ = "1.0.0.dev0"
 # Name to the module that it is imported from when it is used first.
 _API = {
     "Agent": "scilab_rl.api.agent",
+    "ComparisonSummary": "scilab_rl.api.comparison",
     "ConfigError": "scilab_rl.errors",
     "EvaluationSummary": "scilab_rl.api.agent",
+    "Run": "scilab_rl.api.run",
     "ScilabRLError": "scilab_rl.errors",
+    "compare": "scilab_rl.api.comparison",
     "load": "scilab_rl.api.agent",
+    "runs": "scilab_rl.api.run",
+    "train": "scilab_rl.api.run",
 }
 __all__ = [
-    "Agent", "ConfigError", "EvaluationSummary", "ScilabRLError", "__version__", "load",
+    "Agent", "ComparisonSummary", "ConfigError", "EvaluationSummary", "Run", "ScilabRLError",
+    "__version__", "compare", "load", "runs", "train",
 ]  # fmt: skip
 
 

@@ -6,11 +6,11 @@ import argparse
 import logging
 
 from scilab_rl.cli.parser import CommandParser
-from scilab_rl.cli.view import chosen_recordings
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.workspace import open_project
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run
 from scilab_rl.run.provenance import fingerprint_differences
+from scilab_rl.run.recordings import chosen_recordings
 
 _log = logging.getLogger(__name__)
 

@@ -6,15 +6,13 @@ import argparse
 import datetime as dt
 import itertools
 import logging
-import re
 from collections.abc import Iterable, Iterator
-from fnmatch import fnmatchcase
 from pathlib import Path
 
 from scilab_rl.cli.parser import CommandParser, positive
 from scilab_rl.cli.tables import Row, is_terminal, print_json, print_rows
 from scilab_rl.run.directory import RunDirectory, all_runs
-from scilab_rl.run.facts import STATUSES, read_run
+from scilab_rl.run.facts import STATUSES, matches_name, read_run
 from scilab_rl.run.provenance import fingerprint_differences
 from scilab_rl.search.folders import study_names
 
@@ -96,20 +94,12 @@ def _matches_options(record: Row, options: argparse.Namespace) -> bool:
     tags = record["tags"]
     assert isinstance(tags, list)
     return (
-        _matches(record["env"], options.env)
-        and _matches(record["algorithm"], options.algorithm)
+        matches_name(record["env"], options.env)
+        and matches_name(record["algorithm"], options.algorithm)
         and options.status in (None, record["status"])
         and options.study in (None, record[STUDY])
         and (options.tag is None or options.tag in tags)
     )
-
-
-def _matches(value: object, pattern: str | None) -> bool:
-    """Return whether a name matches a pattern, an id also without its version."""
-    if pattern is None:
-        return True
-    names = (str(value), re.sub(r"-v\d+$", "", str(value)))
-    return any(fnmatchcase(name.lower(), pattern.lower()) for name in names)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:

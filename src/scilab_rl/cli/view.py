@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from scilab_rl.cli.parser import CommandParser
-from scilab_rl.errors import ConfigError, did_you_mean
+from scilab_rl.errors import ConfigError
 from scilab_rl.recording.live import (
     LOOPBACK,
     PAGE_PORT,
@@ -24,8 +24,8 @@ from scilab_rl.recording.live import (
     has_display,
     ssh_line,
 )
-from scilab_rl.recording.records import FOLDER, SUFFIX
-from scilab_rl.run.directory import RunDirectory, find_run
+from scilab_rl.run.directory import find_run
+from scilab_rl.run.recordings import chosen_recordings, recordings_of
 
 _log = logging.getLogger(__name__)
 _LOCAL_NAMES = (LOOPBACK, "localhost", "::1")
@@ -42,45 +42,6 @@ def main(arguments: list[str]) -> int:
     recording = chosen_recordings(run, options.episode)[0]
     show(recording, in_browser=options.browser)
     return 0
-
-
-def recordings_of(run: RunDirectory) -> list[Path]:
-    """Return the recorded episodes of a run, oldest first.
-
-    Raises:
-        ConfigError: If there are none.
-    """
-    paths = (run.outputs / FOLDER).glob(f"*{SUFFIX}")
-    recordings = sorted(paths, key=lambda path: path.stat().st_mtime)
-    if not recordings:
-        raise ConfigError(
-            f"The run '{run}' has recorded no episode. Train with render=record, or record its "
-            f"policy with: scilab-rl play {run} --record"
-        )
-    return recordings
-
-
-def chosen_recordings(run: RunDirectory, wanted: str) -> list[Path]:
-    """Return the episode with this number (from 1) or name; ``last``; or ``all`` but probed ones.
-
-    Raises:
-        ConfigError: If there is no such episode.
-    """
-    recordings = recordings_of(run)
-    if wanted == "all":
-        return [path for path in recordings if not path.stem.endswith("_probe")]
-    if wanted == "last":
-        return recordings[-1:]
-    if wanted.isdigit() and 1 <= int(wanted) <= len(recordings):
-        return [recordings[int(wanted) - 1]]
-    named = [path for path in recordings if path.stem == wanted]
-    if named:
-        return named
-    raise ConfigError(
-        f"There is no episode '{wanted}'."
-        f"{did_you_mean(wanted, [path.stem for path in recordings])} There are 1 to "
-        f"{len(recordings)}; `scilab-rl view {run.path.name} --list` names them."
-    )
 
 
 def show(recording: Path, *, in_browser: bool) -> None:

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import PurePath
 
+import numpy as np
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import OverrideParseException
 
 from scilab_rl.errors import ConfigError
 
+_PLAIN = re.compile(r"[\w./:-]+")  # text that means itself, also in lists and mappings
 # The entries of a list: in quotes, or up to the next comma.
 _ENTRY = re.compile(r"""\s*('(?:[^'\\]|\\.)*'|"(?:[^"\\]|\\.)*"|[^,]*)\s*(?:,|$)""", re.DOTALL)
 
@@ -57,6 +60,47 @@ def tuple_as_list(value: str) -> str:
     """
     is_tuple = value.startswith("(") and value.endswith(")") and "(" not in value[1:]
     return f"[{value[1:-1].rstrip(', ')}]" if is_tuple else value
+
+
+def as_override(key: str, value: object) -> str:
+    """Return a value of Python for a key, as it would be typed on the command line.
+
+    Raises:
+        ConfigError: If it is nothing that a configuration can hold.
+
+    >>> as_override("seed", 1), as_override("info", "a, b"), as_override("mlflow", None)
+    ('seed=1', "info='a, b'", 'mlflow=null')
+    >>> as_override("env_kwargs", {"reward_type": "dense", "goals": (1, 2.5)})
+    'env_kwargs={reward_type:dense,goals:[1,2.5]}'
+    """
+    try:
+        return f"{key}={_written(value)}"
+    except TypeError as error:
+        raise ConfigError(
+            f"{key} takes numbers, text, lists, mappings or classes, but it is {value!r}."
+        ) from error
+
+
+def _written(value: object) -> str:
+    if value is None:
+        return "null"
+    if isinstance(value, (bool, np.bool_)):
+        return str(bool(value)).lower()
+    if isinstance(value, (np.generic, np.ndarray)):
+        return _written(value.tolist())
+    if isinstance(value, (int, float)):
+        return repr(value)
+    if isinstance(value, type):
+        return f"{value.__module__}.{value.__qualname__}"
+    if isinstance(value, (str, PurePath)):
+        text = str(value)
+        read = _read(text) if _PLAIN.fullmatch(text) else None
+        return text if read is not None and read.value() == text else _quoted(text)
+    if isinstance(value, Mapping):
+        return f"{{{','.join(f'{name}:{_written(entry)}' for name, entry in value.items())}}}"
+    if isinstance(value, Sequence):
+        return f"[{','.join(map(_written, value))}]"
+    raise TypeError
 
 
 def read_changes(overrides: Sequence[str]) -> Iterator[tuple[str, object]]:

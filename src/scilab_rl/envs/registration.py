@@ -3,18 +3,25 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 import importlib.util
+import logging
 import re
 from collections.abc import Iterable
+from importlib import metadata
 
 import gymnasium as gym
+from gymnasium.envs import registration
 from gymnasium.envs.registration import EnvSpec
 
 from scilab_rl.envs.ids import is_variant, register_shipped, register_variant
 from scilab_rl.envs.suites import SUITES, Suite, suite_of_module, suite_of_name
 from scilab_rl.errors import ConfigError, MissingDependencyError, did_you_mean
 
+_log = logging.getLogger(__name__)
+PLUG_INS = "gymnasium.envs"  # the group of entry points
+_NO_NAMESPACE = ("__root__", "__internal__")
 _VERSIONED = re.compile(r"(?P<name>.*?)(?:-v(?P<version>\d+))?", re.DOTALL)
 # Entry points of ids that stay registered and can no longer be made.
 _ABANDONED = re.compile(r"MujocoPy|mujoco_py|_raise_shimmy_error")
@@ -47,6 +54,9 @@ def resolve_env_id(given: str) -> tuple[str, str | None]:
     assert parsed is not None  # the pattern fits every text
     family, version = parsed["name"], parsed["version"]
     specs = _usable_specs(family)
+    if not specs and name not in gym.registry:
+        register_plug_ins()
+        specs = _usable_specs(family)
     usable = [spec.version for spec in specs]
     if not usable and name not in gym.registry:
         raise ConfigError(
@@ -69,7 +79,29 @@ def known_env_ids() -> list[str]:
     for suite in SUITES:
         if suite.begins and suite.installed:
             _register(suite.package)
+    register_plug_ins()
     return [s.id for s in gym.registry.values() if _is_usable(s) and not is_variant(s.id)]
+
+
+@functools.cache
+def register_plug_ins() -> None:
+    """Let installed packages register their environments, once.
+
+    These are the entry points of the group ``gymnasium.envs``: the name of one is the namespace of
+    its ids, and ``__root__`` means none. Gymnasium has read them until its version 0.29.
+    """
+    for plug_in in metadata.entry_points(group=PLUG_INS):
+        is_root = plug_in.name in _NO_NAMESPACE
+        try:
+            with contextlib.nullcontext() if is_root else registration.namespace(plug_in.name):
+                loaded = plug_in.load()
+                if ":" in plug_in.value:
+                    loaded()
+        except Exception as error:  # noqa: BLE001 - a broken package must not stop the others
+            _log.warning(
+                "The plug-in %s cannot register its environments: %s: %s",
+                plug_in.value, type(error).__name__, error,
+            )  # fmt: skip
 
 
 def _usable_specs(family: str) -> list[EnvSpec]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Collection, Iterator, Mapping
+from fnmatch import fnmatchcase
 from typing import Any
 
 from scilab_rl.config.schema import learning_part
@@ -76,6 +77,18 @@ def read_run(run: RunDirectory, studies: Collection[str] = ()) -> dict[str, obje
         "problem": problem,
         "path": str(run),
     }
+
+
+def matches_name(name: object, pattern: str | None) -> bool:
+    """Return whether a name matches a pattern, an id also without its version.
+
+    >>> matches_name("FetchReach-v4", "fetch*"), matches_name("FetchReach-v4", "FetchReach")
+    (True, True)
+    """
+    if pattern is None:
+        return True
+    names = (str(name), re.sub(r"-v\d+$", "", str(name)))
+    return any(fnmatchcase(known.lower(), pattern.lower()) for known in names)
 
 
 def started(run: RunDirectory) -> str:

@@ -16,7 +16,7 @@ from scilab_rl.results import RunResult
 from scilab_rl.tracking.base import TrackedRun, Tracker
 
 _REFRESH_SECONDS = 0.2
-_SHOWN = (
+SHOWN = (
     ("eval/success_rate", "success"),
     ("eval/mean_reward", "reward"),
     ("eval/mean_ep_length", "length"),
@@ -68,7 +68,7 @@ class ConsoleTracker(Tracker):
 
     def epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
         """Write one line per epoch."""
-        shown = [f"{label} {values[name]:.3g}" for name, label in _SHOWN if name in values]
+        shown = [f"{label} {values[name]:.3g}" for name, label in SHOWN if name in values]
         speed = f"{values['time/fps']:.0f} steps/s"
         self._say(f"epoch {epoch:>3}  {step:>8,} steps  {'  '.join(shown)}  {speed}")
         if self._progress is not None:
@@ -126,7 +126,7 @@ def _result_rows(result: RunResult, run: TrackedRun | None) -> list[tuple[str, s
             ("environment", cfg.env),
             ("seed", str(cfg.seed)),
         ]
-    for name, label in _SHOWN:
+    for name, label in SHOWN:
         if name in result.metrics:
             rows.append((label, f"{result.metrics[name]:.3g}"))
     rows += [

@@ -10,6 +10,7 @@ import pytest
 
 from scilab_rl.cli import view
 from scilab_rl.errors import ConfigError
+from scilab_rl.run.recordings import chosen_recordings, recordings_of
 
 NAMES = ("train_epoch_0001_episode_00000", "eval_epoch_0001_episode_00000", "play_001")
 
@@ -32,22 +33,22 @@ def stems(paths: list[Path]) -> list[str]:
 
 
 def test_by_number_by_name_the_last_and_all_but_probed(run: Any) -> None:
-    assert stems(view.chosen_recordings(run, "2")) == [NAMES[1]]
-    assert stems(view.chosen_recordings(run, "play_001")) == ["play_001"]
-    assert stems(view.chosen_recordings(run, "last")) == ["play_001_probe"]
-    assert stems(view.chosen_recordings(run, "all")) == list(NAMES)
+    assert stems(chosen_recordings(run, "2")) == [NAMES[1]]
+    assert stems(chosen_recordings(run, "play_001")) == ["play_001"]
+    assert stems(chosen_recordings(run, "last")) == ["play_001_probe"]
+    assert stems(chosen_recordings(run, "all")) == list(NAMES)
 
 
 def test_episode_that_does_not_exist(run: Any) -> None:
     with pytest.raises(ConfigError, match=r"no episode 'play_01'\. Did you mean 'play_001'"):
-        view.chosen_recordings(run, "play_01")
+        chosen_recordings(run, "play_01")
     with pytest.raises(ConfigError, match=r"no episode '5'\. There are 1 to 4"):
-        view.chosen_recordings(run, "5")
+        chosen_recordings(run, "5")
 
 
 def test_run_without_recordings_says_how_to_make_one(make_run: Any) -> None:
     with pytest.raises(ConfigError, match=r"Train with render=record, or .* play .* --record"):
-        view.recordings_of(make_run("120000-run"))
+        recordings_of(make_run("120000-run"))
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,6 @@
 import sys
+import types
+from importlib import metadata
 
 import gymnasium as gym
 import pytest
@@ -124,3 +126,26 @@ def test_finding_an_id_imports_only_its_suite():
         "resolve_env_id('Pendulum'); sys.exit('gymnasium_robotics' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_plug_ins_register_their_environments(monkeypatch, caplog) -> None:
+    """Also those with a namespace, and a broken one does not stop the others."""
+    plug_in = types.ModuleType("plugged")
+    plug_in.root = lambda: gym.register("Plugged-v0", "scilab_rl.envs.reach_1dof:Reach1DOF")
+    plug_in.named = lambda: gym.register("Named-v0", "scilab_rl.envs.reach_1dof:Reach1DOF")
+    monkeypatch.setitem(sys.modules, "plugged", plug_in)
+    points = [
+        metadata.EntryPoint(name, value, registration.PLUG_INS)
+        for name, value in (("__root__", "not_there:f"), ("__root__", "plugged:root"),
+                            ("plugged", "plugged:named"))
+    ]  # fmt: skip
+    monkeypatch.setattr(metadata, "entry_points", lambda group: points)
+    registration.register_plug_ins.cache_clear()
+    try:
+        assert resolve_env_id("Plugged") == ("Plugged-v0", None)
+        assert resolve_env_id("plugged/Named")[0] == "plugged/Named-v0"
+        assert "not_there:f cannot register its environments" in caplog.text
+    finally:
+        registration.register_plug_ins.cache_clear()
+        gym.registry.pop("Plugged-v0", None)
+        gym.registry.pop("plugged/Named-v0", None)
