@@ -122,6 +122,23 @@ def test_killed_and_resumed_equals_uninterrupted(algorithm: str, tmp_path: Path)
     assert _weights(killed) == _weights(uninterrupted)
 
 
+@pytest.mark.parametrize("algorithm", ["cleansac", pytest.param("ppo", marks=pytest.mark.slow)])
+def test_a_finished_run_trains_on_as_if_it_had_been_longer(algorithm: str, tmp_path: Path) -> None:
+    """Its last rollout is repeated from its beginning; all that follows is the same bit for bit."""
+    arguments = [f"algorithm={algorithm}", TINY, *QUICK, "early_stop_threshold=2"]
+    if algorithm == "ppo":
+        arguments = [a for a in arguments if "buffer_size" not in a] + ["algorithm.n_steps=32"]
+    assert scilab_rl(*arguments, cwd=tmp_path).returncode == 0
+    longer = last_run(tmp_path)
+    short = [*arguments, "n_epochs=2", "save_model_freq=100000"]
+    assert scilab_rl(*short, cwd=tmp_path).returncode == 0
+    resumed = scilab_rl("resume", "last", "n_epochs=+1", cwd=tmp_path)
+    assert resumed.returncode == 0, resumed.stderr
+    assert untimed_rows(last_run(tmp_path)) == untimed_rows(longer)
+    assert _weights(last_run(tmp_path)) == _weights(longer)
+    assert (last_run(tmp_path) / "curve.png").stat().st_size > 5000
+
+
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_graceful_shutdown_saves_a_checkpoint(
     number: signal.Signals, code: int, tmp_path: Path

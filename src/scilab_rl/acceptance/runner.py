@@ -23,6 +23,7 @@ from scilab_rl.config.schema import learning_config, learning_part
 from scilab_rl.errors import ScilabRLError
 from scilab_rl.parallel.jobs import JobPool
 from scilab_rl.parallel.pool import Pool
+from scilab_rl.parallel.progress import Progress
 from scilab_rl.parallel.worker import Message, Task
 from scilab_rl.run.checks import complete
 from scilab_rl.run.directory import RunDirectory, read_epochs
@@ -148,6 +149,7 @@ class PerformanceTestRunner:
         self.rules = [test.conditions.make_rule() for test in tests]
         self.results = [_stored_result(test, fresh, any_code) for test in tests]
         self.signal_number = 0
+        self.progress = Progress()
         self._running: dict[int, tuple[int, int]] = {}  # job -> test, run
         self._folders: dict[int, str] = {}
         self._attempts: dict[tuple[int, int], int] = {}
@@ -162,8 +164,9 @@ class PerformanceTestRunner:
         Raises:
             TestsInterruptedError: If a signal has stopped the tests.
         """
-        with _signals_to(self):
+        with _signals_to(self), self.progress:
             while not self.signal_number and (self._submit() or self._running):
+                self.progress.show([self.state()])
                 for job, message in self.pool.messages(_POLL_SECONDS):
                     self._handle(job, message)
         if self.signal_number:
@@ -174,6 +177,36 @@ class PerformanceTestRunner:
     def is_open(self, index: int) -> bool:
         """Return whether a test needs more runs."""
         return self.results[index].verdict(self.rules[index]).outcome == OPEN
+
+    def state(self) -> str:
+        """Return how far the tests are, and how long the rest takes.
+
+        A test needs between its fewest and its most runs; each takes as long as the others of the
+        test, or of all tests while it has none.
+        """
+        still_open = [index for index in range(len(self.tests)) if self.is_open(index)]
+        n_decided = len(self.tests) - len(still_open)
+        text = f"{n_decided} of {len(self.tests)} tests decided, {len(self._running)} runs train"
+        times = [self._seconds_per_run(index) for index in still_open]
+        if not times or not all(times):
+            return text
+        minutes = [
+            sum(
+                seconds * max(limit(self.rules[index]) - len(self.results[index].runs), 1)
+                for seconds, index in zip(times, still_open, strict=True)
+            )
+            / self.pool.size
+            / 60
+            for limit in (lambda rule: rule.min_runs, lambda rule: rule.max_runs)
+        ]
+        return f"{text}, between {minutes[0]:.0f} and {minutes[1]:.0f} min left"
+
+    def _seconds_per_run(self, index: int) -> float:
+        """Return the mean duration of the runs of a test, else of all; 0 when there is none."""
+        own = [run.seconds for run in self.results[index].runs.values() if run.seconds]
+        every = [run.seconds for result in self.results for run in result.runs.values()]
+        times = own or [seconds for seconds in every if seconds]
+        return math.fsum(times) / len(times) if times else 0.0
 
     def _submit(self) -> bool:
         """Fill the pool; return whether any test is open."""
@@ -235,11 +268,11 @@ class PerformanceTestRunner:
         verdict = self.results[index].verdict(self.rules[index])
         score = f"{run.value:.3g}" if run.value is not None else f"FAILED: {run.error}"
         mean = f"mean {verdict.mean:.3g} of {verdict.n_runs}" if verdict.n_runs else "no mean yet"
-        _log.info(
-            "%s, run %d: %s after %s steps and %.0f s; %s, target %.3g: %s.",
-            test.name, run.number + 1, score, f"{run.steps:,}", run.seconds, mean,
-            test.conditions.eval_value, verdict.outcome,
-        )  # fmt: skip
+        self.progress.say(
+            f"{test.name}, run {run.number + 1}: {score} after {run.steps:,} steps and "
+            f"{run.seconds:.0f} s; {mean}, target {test.conditions.eval_value:.3g}: "
+            f"{verdict.outcome}."
+        )
 
 
 def read_source(run_dir: Path) -> dict[str, object]:

@@ -30,7 +30,7 @@ SUCCESS, REWARD = "eval/success_rate", "eval/mean_reward"
 _SUCCESS_METRICS = ("eval/success_rate", "eval/success_once_rate")
 SCORES = ("final", "auc", "steps_to_threshold")
 _LAST = 3  # evaluations that make the final value
-_SIGNIFICANT = 0.05
+SIGNIFICANT = 0.05
 _SMALLEST_EFFECT = 0.02  # of the range of scores: smaller effects are ignored
 _N_POINTS = 60
 
@@ -237,7 +237,7 @@ def _contrasts(
     groups: Sequence[GroupEstimates], settings: ComparisonSettings
 ) -> tuple[Contrast, ...]:
     first, raw = groups[0], []
-    level = _SIGNIFICANT / (len(groups) - 1)
+    level = SIGNIFICANT / (len(groups) - 1)
     for group in groups[1:]:
         ours, theirs, paired = _paired(first, group, level)
         raw.append((group, ours, theirs, paired, permutation_test(ours, theirs, paired=paired)))
@@ -247,7 +247,7 @@ def _contrasts(
     for (group, ours, theirs, paired, _), p in zip(raw, corrected, strict=True):
         n = min(min(map(len, ours)), min(map(len, theirs)))
         mean = difference(ours, theirs, "mean", paired=paired)
-        decided = p <= _SIGNIFICANT and mean.value != 0
+        decided = p <= SIGNIFICANT and mean.value != 0
         better = mean.value * sign > 0
         spread = np.ptp(np.concatenate([*ours, *theirs]))
         smallest = _SMALLEST_EFFECT * (float(spread) or 1.0)
@@ -361,6 +361,8 @@ def _varying(runs: Sequence[RunRecord]) -> set[str]:
         configs = [run.config for run in runs if run.task == task]
         keys = {key for config in configs for key in config}
         varying |= {key for key in keys if len({config.get(key) for config in configs}) > 1}
+    if all(run.status != SOLVED for run in runs):  # none of them has stopped early
+        varying = {key for key in varying if not key.startswith("early_stop_")}
     return varying
 
 

@@ -9,14 +9,26 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rich.console import Console
+from rich.progress import track
+
 from scilab_rl.config.schema import learning_config
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.results import PRUNED, SOLVED
 from scilab_rl.run.annotations import read_annotations
-from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, all_runs, find_run, read_epochs
+from scilab_rl.run.directory import (
+    CONFIG_FILE,
+    RunDirectory,
+    all_runs,
+    find_named_run,
+    find_run,
+    read_epochs,
+)
 from scilab_rl.run.facts import all_tags
 from scilab_rl.search.folders import STUDIES, study_names
+from scilab_rl.tracking.console import is_interactive
 
+_MANY = 50  # runs that are read without showing how many are left
 FAILED, UNFINISHED = "failed", ("running", "interrupted")
 # In no estimate: what crashed, what has not ended, and what a study has cut off.
 INCOMPLETE = (FAILED, *UNFINISHED, PRUNED)
@@ -82,8 +94,8 @@ class Group:
 def find_group(word: str, records: Callable[[], list[RunRecord]], base: Path) -> Group:
     """Return the runs that a word selects.
 
-    It is tried as a pattern of run names (with ``*``), a study, a group, an algorithm, a tag, and a
-    run, in this order.
+    It is tried as a pattern of run names (with ``*``), a study, the path or id of a run, a group,
+    an algorithm, a tag, and a part of a run's name, in this order.
 
     Args:
         word: What the user typed; ``label=word`` gives it another name.
@@ -99,6 +111,9 @@ def find_group(word: str, records: Callable[[], list[RunRecord]], base: Path) ->
         return _by_pattern(label, word, records, base)
     if word in study_names(base):
         return _of_study(label, word, base)
+    named = find_named_run(word, base)
+    if named is not None:  # without reading all runs
+        return _of_run(label, named)
     meanings: tuple[tuple[str, Callable[[RunRecord], bool]], ...] = (
         ("group", lambda run: run.group == word),
         ("algorithm", lambda run: run.algorithm == word),
@@ -117,15 +132,17 @@ def find_group(word: str, records: Callable[[], list[RunRecord]], base: Path) ->
             f"'{word}' is not a study, group, algorithm, tag or run in '{base}'."
             f"{did_you_mean(word, names)} There are: {listing(names) or 'none'}."
         ) from error
-    record = read_record(run)
-    if record is None:
-        raise ConfigError(f"The files of the run '{run}' cannot be read.")
-    return Group(label, "run", (record,))
+    return _of_run(label, run)
 
 
 def read_records(base: Path) -> list[RunRecord]:
     """Return all runs below a folder whose configuration can be read, the oldest first."""
-    return [record for run in all_runs(base) if (record := read_record(run)) is not None]
+    runs = list(all_runs(base))
+    shown = track(
+        runs, "Reading runs", console=Console(stderr=True), transient=True,
+        disable=not is_interactive() or len(runs) < _MANY,
+    )  # fmt: skip
+    return [record for run in shown if (record := read_record(run)) is not None]
 
 
 def read_record(run: RunDirectory) -> RunRecord | None:
@@ -157,6 +174,13 @@ def read_record(run: RunDirectory) -> RunRecord | None:
         group=config.get("group"),
         tags=tuple(all_tags(config, read_annotations(run).tags)),
     )
+
+
+def _of_run(label: str, run: RunDirectory) -> Group:
+    record = read_record(run)
+    if record is None:
+        raise ConfigError(f"The files of the run '{run}' cannot be read.")
+    return Group(label, "run", (record,))
 
 
 def _by_pattern(

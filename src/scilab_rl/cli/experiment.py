@@ -21,11 +21,14 @@ def main(arguments: list[str]) -> int:
     options, words = _parse(arguments)
     groups, fixed, n_seeds = read_words(words)
     open_project()
-    from scilab_rl.analysis.experiments import plan, train_missing
+    from scilab_rl.analysis.experiments import plan, power_of, train_missing
     from scilab_rl.parallel.launchers import read_launcher
 
     launcher = read_launcher([*words, *fixed] for words in groups.values())
     planned = plan(groups, fixed, n_seeds, options.first_seed, options.base_logdir)
+    _log.info("%s", power_of(n_seeds, len(planned)))
+    if not any(group.stops_early for group in planned):
+        _log.info("All runs train to their last epoch; early_stop_threshold=0.9 stops them early.")
     for group in planned:
         _log.info(
             "%s: %d of %d runs exist; training %d.",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from scilab_rl.config.compose import compose
@@ -54,8 +54,18 @@ def run(
         )
 
 
-def outcomes(pool: Pool | JobPool, tasks: Sequence[Task]) -> Iterator[tuple[int, Message]]:
-    """Yield the last message of each run, as they come."""
+def outcomes(
+    pool: Pool | JobPool,
+    tasks: Sequence[Task],
+    on_evaluation: Callable[[int, int], None] | None = None,
+) -> Iterator[tuple[int, Message]]:
+    """Yield the last message of each run, as they come.
+
+    Args:
+        pool: Where they train.
+        tasks: The runs.
+        on_evaluation: Called with the number of a run and its steps after each evaluation.
+    """
     waiting = list(enumerate(tasks))
     while waiting or pool.n_busy:
         while waiting and pool.has_room():
@@ -63,6 +73,8 @@ def outcomes(pool: Pool | JobPool, tasks: Sequence[Task]) -> Iterator[tuple[int,
         for number, message in pool.messages(_POLL_SECONDS):
             if message.kind == "evaluated":
                 pool.answer(number, True)
+                if on_evaluation is not None:
+                    on_evaluation(number, message.content["step"])
             elif message.kind != "started":
                 yield number, message
 

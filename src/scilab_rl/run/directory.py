@@ -265,12 +265,10 @@ def find_run(name: str, base: Path) -> RunDirectory:
     Raises:
         ConfigError: If no run or more than one fits.
     """
-    for path in (*_named_agent(name, base), Path(name), base / name):
-        for candidate in (path, path.parent):
-            if (candidate / CONFIG_FILE).is_file():
-                return _opened(candidate.resolve(), base)
+    if (named := find_named_run(name, base)) is not None:
+        return named
     runs = {run.path.name: run for run in all_runs(base)}
-    fitting = [run for run in runs.values() if run.id == name]
+    fitting = [run for run in runs.values() if run.id == name]  # several, or none
     fitting = fitting or [run for run_name, run in runs.items() if name and name in run_name]
     if len(fitting) == 1:
         return fitting[0]
@@ -283,6 +281,22 @@ def find_run(name: str, base: Path) -> RunDirectory:
         f"No run '{name}' in '{base}'.{did_you_mean(name, runs)} "
         "`scilab-rl runs` lists them; 'last' means the newest."
     )
+
+
+def find_named_run(name: str, base: Path) -> RunDirectory | None:
+    """Return the run of this path or id, ``last``, or the agent ``agent:NAME``, if there is one.
+
+    Raises:
+        ConfigError: If there is no such agent.
+    """
+    for path in (*_named_agent(name, base), Path(name), base / name):
+        for candidate in (path, path.parent):
+            if (candidate / CONFIG_FILE).is_file():
+                return _opened(candidate.resolve(), base)
+    if _ID.fullmatch(name):
+        runs = [run for run in all_runs(base) if run.id == name]
+        return runs[0] if len(runs) == 1 else None
+    return None
 
 
 def _named_agent(name: str, base: Path) -> list[Path]:

@@ -114,7 +114,12 @@ def resume_run(
     if step >= cfg.total_steps and ended and ended.status == "finished":
         raise ConfigError(
             f"The run has completed its {ended.epochs} epochs. To continue training: "
-            f"scilab-rl resume {directory} n_epochs={2 * ended.epochs}"
+            f"scilab-rl resume {directory} n_epochs=+{ended.epochs}"
+        )
+    if ended and step < ended.steps:
+        _log.info(
+            "The newest checkpoint is of step %d: what came after it is trained again, exactly.",
+            step,
         )
     with directory.in_use(), _log_file(directory / "train.log"):
         session = build_session(cfg, directory, callbacks)
@@ -132,7 +137,8 @@ def _way_to_train_on(cfg: RunConfig, directory: RunDirectory) -> str:
     if not saved:
         return ""
     return (
-        " To train on from its policy, in a new run: scilab-rl "
+        " Networks and optimizers are kept, the replay buffer and counters are not. To train on "
+        "from its policy, in a new run: scilab-rl "
         f"algorithm={cfg.algorithm.name} env={cfg.env} restore_policy={directory / saved[0]} "
         f"(and what else '{directory / CONFIG_FILE}' sets for the algorithm)."
     )
@@ -206,12 +212,24 @@ class Session:
         with contextlib.ExitStack() as closing:
             closing.callback(self.eval_env.close)
             closing.callback(self.train_env.close)
+            closing.callback(self._draw_curve)  # last: no tracker waits for it
             closing.callback(self.trackers.end, result)
             closing.callback(self.trainer.close)
             try:
                 self.directory.write_result(result)
             except OSError as error:
                 _log.warning("The result of the run cannot be written: %s.", error.strerror)
+
+    def _draw_curve(self) -> None:
+        """Draw the learning curve; a run that has ended cannot fail because of a picture."""
+        from scilab_rl.run.curves import CURVE_FILE, write_run_curve
+
+        store = self.trainer.state.store
+        rows = [{**row, "step": step} for row, step in zip(store.rows, store.steps, strict=True)]
+        try:
+            write_run_curve(rows, self.directory / CURVE_FILE)
+        except Exception as error:  # noqa: BLE001 - the disk may be full, a font missing
+            _log.debug("No %s: %s", CURVE_FILE, error)
 
     def _learn_until_stopped(self, steps_done: int) -> Outcome:
         from scilab_rl.training.policy import FINISHED, save_policy

@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
 
-from rich.console import Console, Group
-from rich.live import Live
-from rich.text import Text
-
+from scilab_rl.parallel.progress import Progress, time_left
 from scilab_rl.search import race
 from scilab_rl.search.runs import COMPLETE, FAILED, LOST, PRUNED, RUNNING, Run, RunHistory
 from scilab_rl.search.settings import StudySettings
 from scilab_rl.search.summary import with_interval
-from scilab_rl.tracking.console import is_interactive
 
 _MARKS = {COMPLETE: "done", PRUNED: "pruned", FAILED: "FAILED", LOST: "lost, will be repeated"}
 
@@ -34,28 +29,23 @@ class StudyProgress:
         self.directory = directory
         self.settings = settings
         self.n_workers = n_workers
-        self._started = time.monotonic()
+        self._progress = Progress()
         self._reported: dict[int, str] = {}
         self._n_before: int | None = None
-        self._live: Live | None = None
 
     def __enter__(self) -> StudyProgress:
-        self._say(
+        self._progress.say(
             f"{self.directory.name}: {self.settings.max_trials} runs, {self.n_workers} at a time; "
             "to end it after the running ones: Ctrl-C, or from elsewhere "
             f"scilab-rl study stop {self.directory.name}"
         )
-        if is_interactive():
-            self._live = Live(console=Console(stderr=True), transient=True, refresh_per_second=2)
-            self._live.start()
+        self._progress.__enter__()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
     ) -> None:
-        if self._live is not None:
-            self._live.stop()
-            self._live = None
+        self._progress.__exit__(kind, error, _)
 
     def update(self, runs: Sequence[Run]) -> None:
         """Tell what has changed."""
@@ -63,10 +53,9 @@ class StudyProgress:
             self._n_before = sum(run.state in _MARKS and not run.is_final for run in runs)
         for run in runs:
             if self._reported.get(run.number) != run.state and run.state in _MARKS:
-                self._say(_line(run))
+                self._progress.say(_line(run))
             self._reported[run.number] = run.state
-        if self._live is not None:
-            self._live.update(Group(*map(Text, self._state(runs))))
+        self._progress.show(self._state(runs))
 
     def _state(self, runs: Sequence[Run]) -> list[str]:
         searched = [run for run in runs if not run.is_final]  # what max_trials counts
@@ -84,10 +73,7 @@ class StudyProgress:
     def _time_left(self, runs: Sequence[Run]) -> str:
         here = sum(run.state in _MARKS for run in runs) - (self._n_before or 0)
         left = self.settings.max_trials - sum(run.state in _MARKS for run in runs)
-        if here < 1 or left < 1:
-            return "time left not known yet" if left > 0 else "last runs"
-        minutes = (time.monotonic() - self._started) / here * left / 60
-        return f"about {minutes:.0f} min left"
+        return time_left(self._progress.seconds, here, left)
 
     def _best(self, runs: Sequence[Run]) -> str:
         rules = self.settings.rules
@@ -98,13 +84,6 @@ class StudyProgress:
         spread = race.spread_of([entry for entry in entries if entry.scores], rules)
         interval = with_interval(best.mean, race.half_width(best, spread))
         return f"configuration #{best.number} with {interval} ({len(best.scores)} runs)"
-
-    def _say(self, line: str) -> None:
-        if self._live is not None:
-            self._live.console.print(line, highlight=False, markup=False)
-        else:
-            sys.stderr.write(line + "\n")
-            sys.stderr.flush()
 
 
 def _line(run: Run) -> str:

@@ -9,7 +9,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 
+from scilab_rl.learning.algorithm import Algorithm
 from scilab_rl.metrics.criteria import is_better, should_stop_early
 from scilab_rl.metrics.store import MetricStore
 from scilab_rl.results import PRUNED, SOLVED
@@ -133,7 +135,8 @@ class Checkpoints(RunCallback):
     Args:
         state: What is saved.
         run_dir: Where.
-        frequency: Environment steps between checkpoints; 0: only where a run stops.
+        frequency: Environment steps between checkpoints, besides one at the start of the last
+            rollout, from which a finished run trains on; 0: only where a run is stopped.
 
     Attributes:
         stop_request: True when a stop is requested.
@@ -146,8 +149,13 @@ class Checkpoints(RunCallback):
         self.frequency = frequency
         self.stop_request = StopRequest()
         self._next = frequency
+        self._total_steps = 0
         self._rollout_start: tuple[int, Snapshot] | None = None
         self._rollout_start_taken = 0.0
+
+    def begin(self, trainer: Trainer) -> None:
+        """Note where the run ends."""
+        self._total_steps = trainer.cfg.total_steps
 
     def save(self, step: int, snapshot: Snapshot) -> bool:
         """Save a checkpoint and return whether it worked; a failure is a warning."""
@@ -185,9 +193,11 @@ class Checkpoints(RunCallback):
         steps = self.state.model.num_timesteps
         if self.stop_request:
             self._stop(steps, self.state.capture())
-        is_due = self.frequency > 0 and steps >= self._next
+        is_last = 0 < self._total_steps <= steps + rollout_steps(self.state.model)
+        is_due = self.frequency > 0 and (steps >= self._next or is_last)
         if is_due:
-            self._next += self.frequency
+            if steps >= self._next:
+                self._next += self.frequency
             self.save(steps, self.state.capture())
         is_old = time.monotonic() - self._rollout_start_taken > 1.0
         if self._rollouts_are_long() and (is_due or is_old):
@@ -208,3 +218,12 @@ class Checkpoints(RunCallback):
         if self.save(step, snapshot):
             _log.info("Stopped at step %d. Resume with: scilab-rl resume %s", step, self.run_dir)
         raise TrainingInterrupted(self.stop_request.signal_number)
+
+
+def rollout_steps(model: Algorithm) -> int:
+    """Return how many environment steps a rollout has, or 0 where the parameters do not say."""
+    frequency = getattr(model, "train_freq", None) or getattr(model, "n_steps", None)
+    if isinstance(frequency, TrainFreq):
+        is_in_steps = frequency.unit == TrainFrequencyUnit.STEP
+        frequency = frequency.frequency if is_in_steps else None
+    return frequency * model.get_env().num_envs if isinstance(frequency, int) else 0
