@@ -16,6 +16,7 @@ from scilab_rl.config.schema import KEYS
 from scilab_rl.config.workspace import config_files
 from scilab_rl.metrics.probes import PROBE_NAMES
 
+from ..e2e.chromium import EXECUTABLE, Chromium
 from ..e2e.commands import quiet_environment
 from .pages import ROOT, pages
 
@@ -49,6 +50,15 @@ def test_nothing_is_fetched_from_elsewhere(site: Path) -> None:
     assert {a or b for a, b in fetched if "canonical" not in a + b} == set()
     styles = "".join(text_of(path) for path in site.rglob("*.css"))
     assert not re.search(r"url\([\"']?https?:", styles)
+
+
+@pytest.mark.skipif(EXECUTABLE is None, reason="needs Chromium")
+def test_search_works_in_pages_opened_from_disk(site: Path) -> None:
+    with Chromium() as browser:
+        browser.open(f"{(site / 'howto' / 'search.html').as_uri()}?q=permutation")
+        found = "document.querySelector('.md-search-result__meta').textContent"
+        browser.wait_for(f"/matching document/.test({found})")
+        assert browser.evaluate("document.querySelectorAll('.md-search-result__item').length") > 0
 
 
 def test_reference_is_complete(site: Path) -> None:
