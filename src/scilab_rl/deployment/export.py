@@ -292,7 +292,7 @@ def _write_arrays(folder: Path, arrays: Mapping[str, np.ndarray]) -> None:
 def _contract(
     run: RunDirectory, cfg: RunConfig, saved: Path, description: PolicyDescription, model: Algorithm
 ) -> dict[str, Any]:
-    """Return what a robot must know beside the numbers."""
+    """Return what a robot must know next to the numbers."""
     env = model.get_env().envs[0]  # type: ignore[attr-defined]
     units, wrappers = units_of(env), [_name_of(wrapper) for wrapper in cfg.wrappers]
     if wrappers:

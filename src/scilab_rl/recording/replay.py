@@ -1,6 +1,6 @@
 """An episode as one HTML file that needs no server, no network and no program but a browser.
 
-``index.html`` beside the pages of a run steps through all of them, or shows two side by side.
+``index.html`` next to the pages of a run steps through all of them, or shows two side by side.
 """
 
 from __future__ import annotations
