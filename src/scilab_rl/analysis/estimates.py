@@ -54,15 +54,24 @@ AGGREGATES: dict[str, Callable[[np.ndarray], np.ndarray]] = {
 }
 
 
-def success_interval(n_successes: int, n_episodes: int) -> Estimate:
-    """Return a success rate with Wilson's interval, which holds for rates near 0 and 1 too.
+def success_interval(n_successes: int, n_episodes: int, method: str = "wilson") -> Estimate:
+    """Return a success rate with a 95 % interval that holds for rates near 0 and 1 too.
+
+    Args:
+        n_successes: How many episodes succeeded.
+        n_episodes: Of how many.
+        method: ``wilson``; or ``exact``, which holds for every rate and is wider (Clopper and
+            Pearson, 1934, "The use of confidence or fiducial limits illustrated in the case of
+            the binomial").
 
     >>> str(success_interval(20, 20))
     '1 [0.839, 1]'
+    >>> str(success_interval(0, 20, "exact"))
+    '0 [0, 0.168]'
     """
     from scipy import stats  # heavy
 
-    interval = stats.binomtest(n_successes, n_episodes).proportion_ci(method="wilson")
+    interval = stats.binomtest(n_successes, n_episodes).proportion_ci(method=method)
     return Estimate(n_successes / n_episodes, float(interval.low), float(interval.high))
 
 

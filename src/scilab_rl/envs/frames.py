@@ -47,6 +47,11 @@ class FrameCapture:
         self._wanted = on
         self._capturing = self._capturing and on
 
+    @property
+    def is_capturing(self) -> bool:
+        """Whether the running episode is captured."""
+        return self._capturing
+
     def begin_episode(self, info: dict[str, object]) -> None:
         """Add the first scene of an episode to the info of its reset."""
         self._capturing = self._wanted

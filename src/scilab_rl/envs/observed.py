@@ -13,7 +13,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnvObs, VecEnvStepR
 
 from scilab_rl.envs.contract import BrokenContractError
 from scilab_rl.envs.frames import FRAME_KEY, STATE_KEY
-from scilab_rl.envs.run_env import FAILURE_KEY
+from scilab_rl.envs.run_env import FAILURE_KEY, START_KEY, EpisodeStart
 from scilab_rl.envs.stability import STATES_KEY
 from scilab_rl.envs.types import Info, Observation
 from scilab_rl.envs.vec_step import ObservedStep, VecStep, decode_step
@@ -47,6 +47,7 @@ class ObservedVecEnv(VecEnvWrapper):
         step_count: Steps so far over all environments.
         reset_frame: The first scene of environment 0's running episode, while frames are captured.
         reset_state: The simulator's state in that scene.
+        episode_start: How that episode began, to repeat it.
         task_rewards: Of the last step, before any normalization. Shapes: ``(n_envs,)``.
     """
 
@@ -70,6 +71,7 @@ class ObservedVecEnv(VecEnvWrapper):
         self.episode_steps = np.zeros(self.num_envs, dtype=np.int64)
         self.reset_frame: np.ndarray | str | None = None
         self.reset_state: np.ndarray | None = None
+        self.episode_start: EpisodeStart | None = None
         self.task_rewards = np.zeros(self.num_envs, dtype=np.float32)
         self._observations: Any = None
         self._actions: np.ndarray | None = None
@@ -165,6 +167,7 @@ class ObservedVecEnv(VecEnvWrapper):
     def _take_first_scene(self) -> None:
         info = self.venv.reset_infos[0]
         self.reset_frame, self.reset_state = info.pop(FRAME_KEY, None), info.pop(STATE_KEY, None)
+        self.episode_start = info.pop(START_KEY, None)
 
     def state(self) -> dict[str, object]:
         """Return counters and current observations, for a checkpoint."""

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import pickle
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeAlias
 
 import gymnasium as gym
 import numpy as np
@@ -22,6 +23,9 @@ from scilab_rl.envs.wrapper_memory import Memory, memory_of, owned, set_memory, 
 
 _log = logging.getLogger(__name__)
 FAILURE_KEY = "scilab_rl.failure"
+START_KEY = "scilab_rl.episode_start"
+# What `replay_episode` needs, without actions.
+EpisodeStart: TypeAlias = dict[str, Any]
 STOP, END_EPISODE, IGNORE = "stop", "end_episode", "ignore"
 
 
@@ -57,7 +61,10 @@ class RunEnv(gym.Wrapper):
         self._generator_state = None if seed is not None else self._generator.bit_generator.state
         self._actions = []
         self._memory = memory_of(self.env)
-        return self._begin(seed, options)
+        observation, info = self._begin(seed, options)
+        if self._frames.is_capturing:
+            info[START_KEY] = self.episode_start()
+        return observation, info
 
     def step(self, action: np.ndarray) -> StepResult:
         """Act, check what comes back and remember the action."""
@@ -83,12 +90,32 @@ class RunEnv(gym.Wrapper):
 
     def episode_state(self) -> dict[str, object]:
         """Return what ``replay_episode`` needs: states before the reset, its arguments, actions."""
+        actions = np.array(self._actions) if self._actions else None
+        return {**self.episode_start(), "actions": actions}
+
+    def episode_start(self) -> EpisodeStart:
+        """Return the same without the actions."""
         return {
             "reset_arguments": self._reset_arguments,
             "generator_state": self._generator_state,
-            "actions": np.array(self._actions) if self._actions else None,
             "memory": self._memory,
         }
+
+    def continue_episode(self, start: EpisodeStart, actions: Sequence[np.ndarray]) -> None:
+        """Remember another episode as the running one, which the environment was put into.
+
+        Args:
+            start: How it began.
+            actions: What was done until here.
+        """
+        self._reset_arguments = dict(start["reset_arguments"])
+        self._generator_state, self._memory = start["generator_state"], start["memory"]
+        self._actions = list(actions)
+
+    def reseed(self, seed: int) -> None:
+        """Give the rest of the episode other random numbers; it cannot be replayed any more."""
+        kind = type(self._generator.bit_generator)
+        self._generator.bit_generator.state = kind(seed).state
 
     def replay_episode(self, state: Info) -> object:
         """Return to a remembered place in an episode.

@@ -71,9 +71,15 @@ def for_evaluation(cfg: RunConfig) -> RunConfig:
     return replace(cfg, n_envs=1, vector="inprocess", wrappers=wrappers)
 
 
+def make_copies(cfg: RunConfig, n: int) -> list[RunEnv]:
+    """Make several of the environment for evaluation, without the layers of a vector of them."""
+    cfg = for_evaluation(cfg)
+    return [make_single_env(cfg) for _ in range(n)]
+
+
 def make_single_env(
     cfg: RunConfig, render_mode: str | None = None, *, in_worker: bool = False
-) -> gym.Env:
+) -> RunEnv:
     """Make one environment with its per-environment wrappers; also called in worker processes."""
     resolve_env_id(cfg.env)  # registers its suite
     try:

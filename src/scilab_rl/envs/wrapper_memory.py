@@ -21,7 +21,7 @@ _PLAIN = (bool, int, float, str, type(None))
 _OWN_MODULES = ("gymnasium.wrappers.common", "scilab_rl.envs.stability")
 _FUNCTIONS = (types.FunctionType, types.MethodType, types.BuiltinFunctionType, partial, np.ufunc)
 _NOT_MEMORY = (gym.Env, gym.Space, types.ModuleType, type, np.dtype, *_FUNCTIONS)
-_BASE_ATTRIBUTES = (
+BASE_ATTRIBUTES = (
     "env",
     "_action_space",
     "_observation_space",
@@ -44,7 +44,7 @@ def memory_of(env: gym.Env) -> Memory:
         name: {
             key: describe(value)
             for key, value in vars(wrapper).items()
-            if key not in _BASE_ATTRIBUTES and not isinstance(value, _NOT_MEMORY)
+            if key not in BASE_ATTRIBUTES and not isinstance(value, _NOT_MEMORY)
         }
         for name, wrapper in _wrappers(env)
     }
@@ -66,6 +66,13 @@ def unknown_memory(memory: Memory) -> list[str]:
         for key, description in attributes.items()
         if _has_unknown(description)
     ]
+
+
+def is_plain(description: object) -> bool:
+    """Return whether what was described has neither unknown parts nor objects of other classes."""
+    if not isinstance(description, (list, tuple)) or not description:
+        return True
+    return description[0] not in (*UNKNOWN, "object") and all(map(is_plain, description))
 
 
 def describe(value: object, levels: int = _MOST_LEVELS) -> object:

@@ -31,6 +31,7 @@ from stable_baselines3.common.vec_env import (
 
 from scilab_rl.canonical_spaces import CanonicalVecEnv, conversions
 from scilab_rl.envs.vec_step import Observation
+from scilab_rl.errors import ConfigError
 from scilab_rl.learning.algorithm import Algorithm
 from scilab_rl.learning.compatibility import is_goal_space
 from scilab_rl.learning.observations import Tensors, batch_of_one
@@ -100,11 +101,16 @@ class AgentInspector:
         That is the value network's answer; for algorithms with action values the mean over the
         critics of Q(s, pi(s)), with the policy's most likely action pi(s).
         """
-        batch = self._batch(observation)
-        if VALUE in self._ask:
-            return float(_numbers(self._ask[VALUE](batch)).item())
-        action, _ = self.algorithm.predict(batch, deterministic=True)
-        return float(self._q_values(batch, action)[0].mean())
+        return float(self._values(self._batch(observation)).item())
+
+    def values(self, observations: Observation) -> np.ndarray:
+        """Return the `value` of each observation of a batch.
+
+        Shapes:
+            observations: ``(batch, ...)`` per entry; result: ``(batch,)``.
+        """
+        with self.undisturbed():
+            return self._values(self._normalized(observations))
 
     def log_prob(self, observation: Observation, action: npt.ArrayLike) -> float:
         """Return log pi(a|s), a density in the algorithm's own units of actions."""
@@ -148,6 +154,27 @@ class AgentInspector:
                 self.normalized(next_observations),
             )
         return _numbers(answer).reshape(-1)
+
+    def act(self, observations: Observation, *, deterministic: bool) -> np.ndarray:
+        """Return what the policy does in each observation of a batch, in the environment's units.
+
+        Args:
+            observations: As the environments give them. Shapes: ``(batch, ...)`` per entry.
+            deterministic: Whether the most likely action is taken.
+
+        Raises:
+            ConfigError: If the policy remembers earlier steps, or sees what cannot be recomputed.
+        """
+        if self.reason:
+            raise ConfigError(self.reason)
+        batch = self._normalized(observations)
+        actions, memory = self.algorithm.predict(batch, deterministic=deterministic)
+        if memory is not None:
+            raise ConfigError(
+                f"{type(self.algorithm).__name__} remembers earlier steps, so that it cannot be "
+                "asked about a single scene."
+            )
+        return np.asarray(self._actions.to_env(actions))
 
     def learned_reward(self, reward: float) -> float:
         """Return a reward in the scale that the critics learn, which VecNormalize may change."""
@@ -193,6 +220,12 @@ class AgentInspector:
 
     def _q_values(self, batch: Observation, actions: np.ndarray) -> np.ndarray:
         return _numbers(self._ask[Q_VALUES](batch, actions))
+
+    def _values(self, batch: Observation) -> np.ndarray:
+        if VALUE in self._ask:
+            return _numbers(self._ask[VALUE](batch)).reshape(-1)
+        actions, _ = self.algorithm.predict(batch, deterministic=True)
+        return self._q_values(batch, actions).mean(axis=1)
 
     def _batch(self, observation: Observation) -> Observation:
         return self.normalized(batch_of_one(observation))

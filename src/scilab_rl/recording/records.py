@@ -67,6 +67,8 @@ class Record:
         state: The simulator's state in this scene, where it can be had.
         values: What is missing is a gap.
         events: What happened to be seen in this scene.
+        start: In the first scene of an episode how it began, to repeat it: see
+            `scilab_rl.envs.scenes.start_as_text`; elsewhere, or where it is unknown, empty.
     """
 
     phase: str
@@ -84,6 +86,7 @@ class Record:
     state: np.ndarray | None = None
     values: dict[Curve, float] = field(default_factory=dict)
     events: list[str] = field(default_factory=list)
+    start: str = ""
 
     @property
     def is_last_scene(self) -> bool:
@@ -347,6 +350,8 @@ def _arrays(clip: Clip) -> dict[str, np.ndarray]:
         "curves": curves,
         "phases": [record.phase for record in records],
         "events": [record.events for record in records],
+        "starts": [record.start for record in records],
+        "action_type": _known_action(records).dtype.str,
     }
     arrays = {
         "about": np.array(json.dumps(about)),
@@ -371,19 +376,27 @@ def _arrays(clip: Clip) -> dict[str, np.ndarray]:
 
 
 def _actions(records: list[Record]) -> np.ndarray:
-    known = next(record.action for record in records if record.action is not None)
-    gap = np.full(known.shape, np.nan)
+    gap = np.full(_known_action(records).shape, np.nan)
     return np.array([gap if record.action is None else record.action for record in records])
+
+
+def _known_action(records: list[Record]) -> np.ndarray:
+    return next(record.action for record in records if record.action is not None)
 
 
 def _clip(arrays: dict[str, np.ndarray]) -> Clip:
     about = json.loads(str(arrays["about"]))
     clip = Clip(_info(arrays))
+    # Repeating an episode to the last bit takes the actions in their own type.
+    action_type = np.dtype(about.get("action_type", arrays["action"].dtype.str))
     data = arrays["picture"].tobytes()
     for index, end in enumerate(arrays["picture_ends"]):
         start = int(arrays["picture_ends"][index - 1]) if index else 0
         record = _record(arrays, index, data[start : int(end)])
         record.phase, record.events = about["phases"][index], about["events"][index]
+        record.start = about.get("starts", {index: ""})[index]
+        if record.action is not None:
+            record.action = record.action.astype(action_type)
         numbers = zip(about["curves"], arrays["values"][index].tolist(), strict=True)
         record.values = {Curve(*curve): n for curve, n in numbers if not math.isnan(n)}
         clip.records.append(record)

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from scilab_rl.envs.observed import ObservedVecEnv
+from scilab_rl.envs.scenes import start_as_text
 from scilab_rl.envs.vec_step import ObservedStep
 from scilab_rl.errors import did_you_mean
 from scilab_rl.learning.inspector import AgentInspector
@@ -175,9 +176,14 @@ class Timeline:
                 observation, action, reward, next_observation, info, done, terminated
             ),
             self._events.of_scene(observation, self._last_success),
+            self._start_of_episode(step),
         )
         self._last_success = record.success
         return record
+
+    def _start_of_episode(self, step: ObservedStep) -> str:
+        is_first = step.episode_steps[_ENV] == 0 and self.env.episode_start is not None
+        return start_as_text(self.env.episode_start) if is_first else ""
 
     def _last_scene(self, step: ObservedStep) -> Record:
         frame, state = self._scene
