@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from gymnasium import spaces
@@ -130,7 +130,7 @@ class FuturePlayer:
         if not records[0].start or records[0].step or any(r.step == 0 for r in records[1:]):
             raise ConfigError(
                 f"The recording {clip.info.name} cannot be taken up again: it must be of one whole "
-                "episode, and recorded by this version. `scilab-rl whatif RUN --seed 1` records one."
+                "episode, and of this version. `scilab-rl whatif RUN --seed 1` records one."
             )
         actions = [record.action for record in records if record.action is not None]
         observed = [record.observation for record in records]
@@ -153,6 +153,7 @@ class FuturePlayer:
         """
         import torch
 
+        change = replace(change, action=self._checked(change.action))
         seed = derive_seed(change.seed, "whatif")
         self._rng = np.random.default_rng(seed)
         with self.inspector.undisturbed():
@@ -160,6 +161,21 @@ class FuturePlayer:
             torch.manual_seed(seed)
             with ThreadPoolExecutor(min(n_cores(), len(self.envs))) as threads:
                 return self._play(scenes, change, deterministic, threads)
+
+    def _checked(self, action: np.ndarray | None) -> np.ndarray | None:
+        """Return an action in the environment's own type.
+
+        Raises:
+            ConfigError: If it is not one of its actions.
+        """
+        space = self.envs[0].action_space
+        if action is None:
+            return None
+        shape, size = space.shape or (), int(np.prod(space.shape or ()))
+        converted = np.asarray(action).astype(space.dtype).reshape(-1)
+        if len(converted) != size or not space.contains(converted.reshape(shape)[()]):
+            raise ConfigError(f"An action must be one of {space}, but it is {np.asarray(action)}.")
+        return converted.reshape(shape)
 
     def _play(
         self,
@@ -230,10 +246,10 @@ class FuturePlayer:
         space = self.envs[0].observation_space
         if isinstance(space, spaces.Dict):
             return {
-                key: np.stack([o[key] for o in observations]).astype(space[key].dtype)  # type: ignore[call-overload]
+                key: np.stack([o[key] for o in observations]).astype(space[key].dtype)
                 for key in space.spaces
             }
-        return np.stack(observations).astype(space.dtype)  # type: ignore[arg-type]
+        return np.stack([np.asarray(o) for o in observations]).astype(space.dtype)
 
     def _note_values(self, seen: Observation, futures: Sequence[Future]) -> None:
         if VALUE in self.inspector.quantities:

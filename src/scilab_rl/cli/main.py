@@ -20,6 +20,7 @@ COMMANDS = {
     "play": "watch or record a trained policy and measure its success",
     "view": "look at recorded episodes",
     "probe": "compute metrics for recorded episodes, also with other checkpoints",
+    "whatif": "play other futures of a recorded episode: when was it decided?",
     "resume": "continue an interrupted run",
     "new": "create an algorithm of your own from an existing one",
     "runs": "list the recorded runs",

@@ -112,7 +112,7 @@ class EpisodeScenes:
         expected: Sequence[Observation] | None = None,
     ) -> None:
         self._start, self._actions = start, list(actions)
-        self.observations: list[Observation] = [env.replay_episode({**start, "actions": None})]
+        self.observations: list[Observation] = [_replayed(env, start, [])]
         self.rewards: list[float] = []
         self._snapshots = [take_snapshot(env.env)]
         for action in self._actions:
@@ -133,7 +133,7 @@ class EpisodeScenes:
         actions = self._actions[:scene]
         snapshot = self._snapshots[scene] if self.is_fast else None
         if snapshot is None:
-            return env.replay_episode({**self._start, "actions": actions})  # type: ignore[return-value]
+            return _replayed(env, self._start, actions)
         put_snapshot(env.env, snapshot)
         env.continue_episode(self._start, actions)
         return self.observations[scene]
@@ -185,6 +185,7 @@ def change_goal(env: gym.Env, observation: Observation, goal: np.ndarray) -> Obs
             f"{observation['desired_goal'].tolist()}), but {np.size(goal)} were given."
         )
     inner: Any = env.unwrapped
+    owner: Any
     for owner in (inner, getattr(inner, "task", None)):  # panda-gym's goal belongs to its task
         if isinstance(getattr(owner, "goal", None), np.ndarray):
             owner.goal = np.array(goal, owner.goal.dtype)
@@ -221,6 +222,11 @@ def _array_from_json(entry: dict[str, Any]) -> np.ndarray:
     return np.array(entry["values"], entry["dtype"])
 
 
+def _replayed(env: RunEnv, start: EpisodeStart, actions: Sequence[np.ndarray]) -> Observation:
+    observation: Any = env.replay_episode({**start, "actions": actions})
+    return observation
+
+
 def _refuse_difference(
     env: RunEnv, observations: Sequence[Observation], expected: Sequence[Observation]
 ) -> None:
@@ -245,7 +251,8 @@ def _derived_names(data: Any) -> list[str]:
 
 def _layers(env: gym.Env) -> list[gym.Env]:
     """Return an environment, those that it wraps, and those that it has as attributes."""
-    layers, waiting = [], [env]
+    layers: list[gym.Env] = []
+    waiting = [env]
     while waiting:
         layer = waiting.pop()
         if all(layer is not other for other in layers):

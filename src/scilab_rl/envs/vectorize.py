@@ -71,10 +71,10 @@ def for_evaluation(cfg: RunConfig) -> RunConfig:
     return replace(cfg, n_envs=1, vector="inprocess", wrappers=wrappers)
 
 
-def make_copies(cfg: RunConfig, n: int) -> list[RunEnv]:
+def make_copies(cfg: RunConfig, n: int, render_mode: str | None = None) -> list[RunEnv]:
     """Make several of the environment for evaluation, without the layers of a vector of them."""
     cfg = for_evaluation(cfg)
-    return [make_single_env(cfg) for _ in range(n)]
+    return [make_single_env(cfg, render_mode) for _ in range(n)]
 
 
 def make_single_env(

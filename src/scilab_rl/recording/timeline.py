@@ -182,8 +182,8 @@ class Timeline:
         return record
 
     def _start_of_episode(self, step: ObservedStep) -> str:
-        is_first = step.episode_steps[_ENV] == 0 and self.env.episode_start is not None
-        return start_as_text(self.env.episode_start) if is_first else ""
+        start = self.env.episode_start
+        return "" if start is None or step.episode_steps[_ENV] else start_as_text(start)
 
     def _last_scene(self, step: ObservedStep) -> Record:
         frame, state = self._scene
