@@ -8,7 +8,7 @@ the episode was decided.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
@@ -306,7 +306,6 @@ def find_decision(
     *,
     n_futures: int,
     every: int = 1,
-    on_progress: Callable[[int, int], None] | None = None,
 ) -> tuple[list[Future], Decision]:
     """Play futures of the scenes of an episode, and find the one from which on it was decided.
 
@@ -316,7 +315,6 @@ def find_decision(
         change: What differs.
         n_futures: Of each scene.
         every: Steps between the scenes; those around the decision are then all asked about.
-        on_progress: Called with the number of scenes that are done, and of all.
 
     Raises:
         ConfigError: If the task does not report success.
@@ -329,22 +327,16 @@ def find_decision(
         )
     n_steps = len(player.scenes) - 1
     scenes = list(range(0, n_steps, every))
-    futures = _play_scenes(player, scenes, change, n_futures, on_progress)
+    futures = _play_scenes(player, scenes, change, n_futures)
     found = decision(rates_of(futures), n_steps, succeeded=outcome)
     between = [s for s in range(max(0, found.scene - every + 1), found.scene) if s not in scenes]
-    futures += _play_scenes(player, between, change, n_futures, None)
+    futures += _play_scenes(player, between, change, n_futures)
     return futures, decision(rates_of(futures), n_steps, succeeded=outcome)
 
 
 def _play_scenes(
-    player: FuturePlayer,
-    scenes: Sequence[int],
-    change: Change,
-    n_futures: int,
-    on_progress: Callable[[int, int], None] | None,
+    player: FuturePlayer, scenes: Sequence[int], change: Change, n_futures: int
 ) -> list[Future]:
-    if on_progress is not None:
-        on_progress(len(scenes), n_futures)
     return player.play([scene for scene in scenes for _ in range(n_futures)], change)
 
 

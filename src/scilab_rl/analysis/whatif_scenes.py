@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from scilab_rl.envs.scene_painting import Scene
 
 _MOST_PLACES = 4  # of a goal that are drawn, for example blocks
-_SMALLEST = (
-    0.15  # of the model's extent: size of what the camera looks at, so that the robot is seen
-)
+# The size of what the camera looks at: in the extent of the places, and at least, so that something
+# of the robot is seen, in the extent of the model.
+_ZOOM, _SMALLEST = 0.75, 0.12
 Pixels = list[list[float]]  # as shares of width and height
 
 
@@ -78,7 +78,8 @@ def render_scenes(
         return None
     low, high = np.min(places, axis=0), np.max(places, axis=0)
     env.reset(seed=0)
-    size = max(float(np.linalg.norm(high - low)), _SMALLEST * env.unwrapped.model.stat.extent)  # type: ignore[attr-defined]
+    extent = float(env.unwrapped.model.stat.extent)  # type: ignore[attr-defined]
+    size = max(_ZOOM * float(np.linalg.norm(high - low)), _SMALLEST * extent)
     pictures, view = {}, None
     for scene in scenes:
         observation = episode.put(env, scene)

@@ -110,7 +110,7 @@ class AgentInspector:
             observations: ``(batch, ...)`` per entry; result: ``(batch,)``.
         """
         with self.undisturbed():
-            return self._values(self._normalized(observations))
+            return self._values(self.normalized(observations))
 
     def log_prob(self, observation: Observation, action: npt.ArrayLike) -> float:
         """Return log pi(a|s), a density in the algorithm's own units of actions."""
@@ -167,7 +167,7 @@ class AgentInspector:
         """
         if self.reason:
             raise ConfigError(self.reason)
-        batch = self._normalized(observations)
+        batch = self.normalized(observations)
         actions, memory = self.algorithm.predict(batch, deterministic=deterministic)
         if memory is not None:
             raise ConfigError(
