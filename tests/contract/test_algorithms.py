@@ -20,6 +20,8 @@ def test_continues_without_goals_as_if_it_had_not_been_interrupted(algorithm, tm
     contract = AlgorithmContract()
     contract.algorithm = algorithm
     contract.env = fitting_environment(contract._class(), with_goals=False)
+    if contract.env == fitting_environment(contract._class()):
+        pytest.skip("the contract test above is without goals")
     contract.test_continues_as_if_it_had_not_been_interrupted(tmp_path)
 
 

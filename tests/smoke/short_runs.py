@@ -14,7 +14,6 @@ from omegaconf import OmegaConf
 
 from scilab_rl.acceptance.conditions import performance_tests
 from scilab_rl.config import compose as composition
-from scilab_rl.config.schema import RunConfig
 from scilab_rl.config.workspace import config_files, open_project
 from scilab_rl.envs.ids import FAMILIES
 from scilab_rl.envs.registration import module_of, resolve_env_id
@@ -25,6 +24,7 @@ from scilab_rl.results import RunResult
 from scilab_rl.run.checks import algorithm_class, complete
 from scilab_rl.run.directory import RunDirectory
 from scilab_rl.run.run import start_run
+from scilab_rl.testing.algorithms import fitting_environment
 
 SHORT = (
     "eval_after_n_steps=40",
@@ -132,16 +132,11 @@ def can_draw(env_id: str) -> bool:
     return "rgb_array" in getattr(made, "metadata", {"render_modes": ["rgb_array"]})["render_modes"]
 
 
-def fitting_environment(algorithm: str) -> str:
+def environment_of(algorithm: str) -> str:
     """Return the first tiny environment whose spaces fit an algorithm."""
     with missing_packages_skip():
         cls = algorithm_class(compose(f"algorithm={algorithm}"))
-    names = ("TinyReach", "TinyReachDiscrete", "TinyBox", "TinyDiscrete")
-    for env_id in (f"scilab_rl.testing:{name}-v0" for name in names):
-        with contextlib.suppress(ConfigError):
-            check_pair(algorithm, cls, env_id, make_single_env(RunConfig(env_id)))
-            return env_id
-    raise AssertionError(f"no tiny environment fits {algorithm}")
+    return fitting_environment(cls)
 
 
 def names_of_tests_and_searches() -> tuple[list[str], list[str]]:

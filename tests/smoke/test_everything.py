@@ -27,10 +27,10 @@ from tests.smoke.short_runs import (
     algorithms,
     can_draw,
     compose,
+    environment_of,
     environments,
     finished_well,
     fitting_algorithm,
-    fitting_environment,
     missing_packages_skip,
     names_of_tests_and_searches,
     train,
@@ -74,7 +74,7 @@ def simulator_for(env: str, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[s
 
 @pytest.mark.parametrize("algorithm", algorithms())
 def test_algorithm_trains_saves_loads_and_resumes(algorithm: str, tmp_path: Path) -> None:
-    env = fitting_environment(algorithm)
+    env = environment_of(algorithm)
     told = (f"algorithm={algorithm}", f"env={env}", "save_model_freq=20")
     first = train(tmp_path, *told)
     assert finished_well(first)
@@ -127,7 +127,7 @@ def test_search_composes_and_starts(choice: str, tmp_path: Path) -> None:
     setting = {p.name: p.labels[0] if p.choices else p.low for p in space.parameters}
     env = []
     if "env" not in stored:
-        env = [f"env={fitting_environment(compose(f'+{choice}').algorithm.name)}"]
+        env = [f"env={environment_of(compose(f'+{choice}').algorithm.name)}"]
     overrides = [f"+{choice}", *env, *space.overrides(setting)]
     result = train(tmp_path, *overrides, *_SHORTER)
     assert finished_well(result)

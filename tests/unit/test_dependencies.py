@@ -18,12 +18,17 @@ DISTRIBUTIONS = {
     "PIL": "pillow", "yaml": "pyyaml", "hydra": "hydra-core", "rerun": "rerun-sdk",
     "stable_baselines3": "stable-baselines3", "zmq": "pyzmq", "highway_env": "highway-env",
 }  # fmt: skip
+MODELS = (
+    "hybrid", "kalmanthompson", "kalmanucb", "randomchoice", "rescorlawagner", "rescorlawagner2",
+    "rescorlawagnersticky", "winstayloseshift",
+)  # fmt: skip
 # Modules that are imported only where their package is known to be installed, or for its users.
 BEHIND_AN_EXTRA = {
     "learning/jax_engine.py", "learning/jax_off_policy.py",
-    "algorithms/jaxsac.py", "algorithms/jaxtd3.py",
+    "algorithms/jaxsac.py", "algorithms/jaxtd3.py", "learning/cognitive.py",
+    *(f"algorithms/models/{name}.py" for name in MODELS),
     "envs/suites/highway_env.py", "envs/suites/metaworld.py", "envs/suites/panda_gym.py",
-    "testing/algorithms.py",
+    "testing/algorithms.py", "testing/models.py",
 }  # fmt: skip
 
 

@@ -1,4 +1,4 @@
-"""``scilab-rl new algorithm NAME --from PARENT``: create an algorithm from an existing one.
+"""``scilab-rl new algorithm|model NAME --from PARENT``: create one from an existing one.
 
 As in the paper, a new idea starts as a copy of an algorithm under a new name, in which a few lines
 are changed. This command makes the copy, its YAML and its contract test, which run without changes.
@@ -38,12 +38,22 @@ _PACKAGE_DOCSTRING = (
 )
 # Environments to train in, in the order of preference.
 _EXAMPLES = ("FetchReach", "Pendulum-v1", "CartPole-v1")
+_PARENTS = {"algorithm": "cleansac", "model": "rescorlawagner"}
 _TEST = '''"""The contract test of every algorithm, for {name}: python -m pytest {path}"""
 
 from scilab_rl.testing.algorithms import AlgorithmContract
 
 
 class Test{camel}(AlgorithmContract):
+    algorithm = "{name}"
+'''
+_MODEL_TEST = '''"""The contract tests of cognitive models, for {name}: python -m pytest {path}"""
+
+from scilab_rl.testing.algorithms import AlgorithmContract
+from scilab_rl.testing.models import ModelContract
+
+
+class Test{camel}(ModelContract, AlgorithmContract):
     algorithm = "{name}"
 '''
 
@@ -60,23 +70,26 @@ def main(arguments: list[str]) -> int:
         return new_intrinsic.main(arguments[1:])
     parser = CommandParser(
         "new",
-        "Create an algorithm of your own as a copy of an existing one, or an environment or an "
-        "intrinsic reward (`scilab-rl new environment --help`, `scilab-rl new intrinsic --help`).",
+        "Create an algorithm or a cognitive model of your own as a copy of an existing one, or an "
+        "environment or an intrinsic reward (`scilab-rl new environment --help`, "
+        "`scilab-rl new intrinsic --help`).",
     )
-    kinds = ("algorithm", "environment", "intrinsic")
+    kinds = (*_PARENTS, "environment", "intrinsic")
     parser.add_argument("kind", choices=kinds, help="what to create")
     parser.add_argument("name", help="its name, for example my_idea")
     parser.add_argument(
         "--from",
         dest="parent",
-        default="cleansac",
         metavar="PARENT",
-        help="the algorithm to copy (default cleansac); `scilab-rl algorithms` lists all",
+        help="what to copy (default: cleansac; of a model: rescorlawagner); `scilab-rl algorithms` "
+        "lists all",
     )
     options = parser.parse_args(arguments)
     open_project()
     check_name(options.name)
-    parent = Parent(options.parent)
+    parent = Parent(options.parent or _PARENTS[options.kind])
+    if options.kind == "model" and not parent.is_model:
+        raise ConfigError(f"'{parent.name}' is not a cognitive model; use `new algorithm`.")
     contents = contents_of(options.name, parent)
     write_new(contents)
     _explain(options.name, parent, list(contents))
@@ -115,6 +128,11 @@ class Parent:
             raise ConfigError(
                 f"'{options[name]}' names '{target}', which cannot be copied: {error}"
             ) from error
+
+    @property
+    def is_model(self) -> bool:
+        """Whether it is a cognitive model, which can be fitted to choices."""
+        return any(base.__name__ == "CognitiveModel" for base in self.cls.__mro__)
 
     @property
     def origin(self) -> str:
@@ -180,11 +198,12 @@ def contents_of(name: str, parent: Parent) -> dict[Path, str]:
         ConfigError: If one exists, or the parent's source already uses the name.
     """
     test = _TESTS / f"test_{name}.py"
+    template = _MODEL_TEST if parent.is_model else _TEST
     return new_files(
         {
             PROJECT_ALGORITHMS / f"{name}.py": source_of(name, parent),
             PROJECT_CONF / "algorithm" / f"{name}.yaml": yaml_of(name, parent),
-            test: _TEST.format(name=name, camel=camel(name), path=test),
+            test: template.format(name=name, camel=camel(name), path=test),
         }
     )
 
@@ -324,6 +343,8 @@ def _example_env(cls: type) -> str:
     from scilab_rl.learning.compatibility import reads_dictionaries, supported_action_spaces
 
     goal, vector, discrete = _EXAMPLES
+    if stages := getattr(cls, "n_stages", 0):  # a cognitive model
+        return "TwoStep" if stages == 2 else "Bandit"
     kinds: tuple[type[spaces.Space], ...] = supported_action_spaces(cls) or (spaces.Box,)
     if spaces.Box not in kinds:
         return discrete

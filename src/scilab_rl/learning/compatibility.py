@@ -115,6 +115,9 @@ def check_pair(
             f"{type(action_space).__name__} actions. "
             + (f"These can: {others}." if others else "None of the algorithms can.")
         )
+    problem_of = getattr(cls, "observation_problem", None)
+    if problem_of is not None and (why := problem_of(observation_space)):
+        raise ConfigError(f"{name} cannot act in {env_id}: {why}")
     if isinstance(action_space, spaces.Box) and (problem := bounds_problem(action_space)):
         raise ConfigError(
             f"The actions of {env_id} have {problem}; give them some with 'wrappers=[{{_target_: "

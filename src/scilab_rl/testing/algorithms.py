@@ -50,7 +50,12 @@ from scilab_rl.training.snapshot import capture, random_state, restore, set_rand
 
 DEVICE_VARIABLE = "SCILAB_RL_TEST_DEVICE"
 # In the order of preference: the first one whose spaces the algorithm takes.
-_WITHOUT_GOALS = ("scilab_rl.testing:TinyBox-v0", "scilab_rl.testing:TinyDiscrete-v0")
+_WITHOUT_GOALS = (
+    "scilab_rl.testing:TinyBox-v0",
+    "scilab_rl.testing:TinyDiscrete-v0",
+    "HiddenGoal-v0",  # of cognitive models
+    "TwoStep-v0",
+)
 _CANDIDATES = (
     "scilab_rl.testing:TinyReach-v0",
     "scilab_rl.testing:TinyReachDiscrete-v0",
