@@ -18,6 +18,7 @@ from docs.generate import table
 
 from scilab_rl import files
 from scilab_rl.acceptance.agents import CARD_FILE, PAGE_FILE, read_card
+from scilab_rl.acceptance.conditions import stated
 from scilab_rl.acceptance.rules import PASS
 from scilab_rl.config.workspace import SHIPPED_AGENTS, SHIPPED_CONF
 
@@ -119,9 +120,11 @@ def best_table() -> Iterator[str]:
     columns = ("task", "algorithm", "result", "95 % interval", "steps", "minutes", "measured in")
     yield from table((*columns, "outcome", "from"), rows)
     untested = sorted(set(_shipped_tests()) - {path.as_posix() for path in _names()})
-    yield f"Shipped performance tests without a stored result ({len(untested)}): " + (
-        ", ".join(f"`{name}`" for name in untested) or "none"
-    ) + "."  # fmt: skip
+    yield (
+        f"Shipped performance tests without a stored result ({len(untested)}), with about the "
+        "hours of one core that three runs take:"
+    )
+    yield ", ".join(f"`{name}` ({_hours(name):g})" for name in untested) + "."
 
 
 def tests_table() -> Iterator[str]:
@@ -134,6 +137,11 @@ def tests_table() -> Iterator[str]:
         for result in of_tests()
     ]  # fmt: skip
     yield from table((*columns, "minutes", "measured in", "outcome"), rows)
+
+
+def _hours(name: str) -> float:
+    path = SHIPPED_CONF / "performance" / f"{name}.yaml"
+    return float(str(stated(path, "hours")))
 
 
 TABLES = {"learned": best_table, "tests": tests_table}

@@ -54,6 +54,8 @@ class Conditions:
         max_runs: The budget; None means the rule's own.
         n_episodes: Evaluation episodes of each finished policy.
         tier: The smallest set of tests that this one belongs to.
+        hours: About how long three runs of ``max_steps`` take, in hours of one core; stated where
+            no baseline says it.
         seed: The seeds of the runs follow from it.
     """
 
@@ -69,6 +71,7 @@ class Conditions:
     max_runs: int | None = None
     n_episodes: int = 100
     tier: str = "release"
+    hours: float | None = None
     seed: int = 1
 
     @property
@@ -222,7 +225,12 @@ def performance_tests() -> dict[str, Path]:
 
 def tier_of(path: Path) -> str:
     """Return the tier of a test's file."""
-    return str(read_yaml(path)[KEY].get("tier", Conditions.tier))
+    return str(stated(path, "tier"))
+
+
+def stated(path: Path, key: str) -> object:
+    """Return a condition of a test's file, or its default."""
+    return read_yaml(path)[KEY].get(key, getattr(Conditions, key))
 
 
 def select(patterns: list[str], tier: str | None) -> list[str]:

@@ -22,15 +22,30 @@ def main(arguments: list[str]) -> int:
     """Run the command and return its exit code: 0 passed, 1 failed, 3 undecided or crashed."""
     options = _parse(arguments)
     open_project()
-    from scilab_rl.acceptance.conditions import performance_tests, select, tier_of
+    from scilab_rl.acceptance.conditions import select
 
     names = select(options.patterns, options.tier)
     if options.list:
-        files = performance_tests()
-        rows = [{"test": name, "tier": tier_of(files[name])} for name in names]
-        print_rows(("test", "tier"), rows, as_json=options.json)
+        rows = [_listed(name, options.baselines) for name in names]
+        print_rows(tuple(rows[0]), rows, as_json=options.json)
         return 0
     return _run(names, options)
+
+
+def _listed(name: str, baselines: Path) -> dict[str, object]:
+    """Return the row of a test: its tier, what it costs, and the result that is stored."""
+    from scilab_rl.acceptance.baselines import read_baseline
+    from scilab_rl.acceptance.conditions import performance_tests, stated
+
+    path = performance_tests()[name]
+    row: dict[str, object] = {"test": name, "tier": stated(path, "tier")}
+    stored = read_baseline(name, baselines)
+    if stored is None:
+        return {**row, "hours": stated(path, "hours"), "stored": None}
+    hours = sum(run.seconds for run in stored.in_order()) / 3600
+    values = [run.value for run in stored.in_order() if run.value is not None]
+    mean = f"{sum(values) / len(values):.3g} in {len(values)} runs"
+    return {**row, "hours": float(f"{hours:.1g}"), "stored": mean}
 
 
 def _run(names: list[str], options: argparse.Namespace) -> int:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 from omegaconf import OmegaConf
 
@@ -12,10 +14,12 @@ from scilab_rl.acceptance.conditions import (
     performance_tests,
     read_conditions,
     select,
+    stated,
 )
 from scilab_rl.acceptance.rules import ReferenceRule, SequentialTest
 from scilab_rl.errors import ConfigError
 
+BASELINES = Path(__file__).parents[3] / "baselines"
 GIVEN = {"eval_columns": "eval/success_rate", "eval_value": 0.9, "max_steps": 10_000}
 REFERENCE = {"total_runs": 3, "succ_runs": 2, **GIVEN}
 
@@ -131,3 +135,9 @@ def test_tests_are_selected_by_name_and_tier() -> None:
     assert pr < nightly < everything
     with pytest.raises(ConfigError, match="No performance test matches 'FetchReech'"):
         select(["FetchReech"], None)
+
+
+@pytest.mark.parametrize("name", performance_tests())
+def test_each_shipped_test_has_a_stored_result_or_says_what_it_costs(name):
+    hours = stated(performance_tests()[name], "hours")
+    assert (BASELINES / f"{name}.json").is_file() != isinstance(hours, (int, float))
