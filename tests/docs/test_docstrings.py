@@ -12,7 +12,13 @@ import pytest
 from .pages import ROOT
 
 SOURCE = ROOT / "src" / "scilab_rl"
-NEEDS = {"jax_engine": "jax", "jax_off_policy": "jax", "jaxsac": "jax", "jaxtd3": "jax"}
+NEEDS = {
+    "jax_engine": "jax",
+    "jax_off_policy": "jax",
+    "jaxcrl": "jax",
+    "jaxsac": "jax",
+    "jaxtd3": "jax",
+}
 
 
 def modules_with_examples() -> list[Path]:

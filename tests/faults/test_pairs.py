@@ -30,6 +30,7 @@ ORACLE = {
     "crossq": "y---------yy---",  # it has no policy for dictionaries
     "ddpg": _SB3_MOVES,
     "dqn": _CHOICES,
+    "jaxcrl": "--y------------",  # it learns from goals alone
     "jaxsac": _MOVES,
     "jaxtd3": _MOVES,
     "onestepac": _CHOICES,

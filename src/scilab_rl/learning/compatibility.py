@@ -109,11 +109,14 @@ def check_pair(
     allowed = supported_action_spaces(cls)
     action_space, observation_space = env.action_space, env.observation_space
     if allowed is not None and not isinstance(action_space, allowed):
-        others = ", ".join(fitting())
         raise ConfigError(
             f"{name} needs {_names(allowed)} actions, but {env_id} has "
-            f"{type(action_space).__name__} actions. "
-            + (f"These can: {others}." if others else "None of the algorithms can.")
+            f"{type(action_space).__name__} actions. {_which_can(fitting)}"
+        )
+    if getattr(cls, "needs_goals", False) and not is_goal_space(observation_space):
+        raise ConfigError(
+            f"{name} learns to reach goals, and {env_id} has none (Dict observations with "
+            f"{', '.join(GOAL_KEYS)}). {_which_can(fitting)}"
         )
     problem_of = getattr(cls, "observation_problem", None)
     if problem_of is not None and (why := problem_of(observation_space)):
@@ -156,6 +159,11 @@ def _unreadable(key: str, entry: spaces.Space) -> str | None:
     if is_image_space(entry) and not is_large_image(entry):
         return f"its network for images needs at least {_SMALLEST_IMAGE} x {_SMALLEST_IMAGE} pixels"
     return None
+
+
+def _which_can(fitting: Callable[[], Iterable[str]]) -> str:
+    others = ", ".join(fitting())
+    return f"These can: {others}." if others else "None of the algorithms can."
 
 
 def _names(kinds: Iterable[type[spaces.Space]]) -> str:

@@ -2,8 +2,9 @@
 
 One adapter for Stable-Baselines3, sb3_contrib, our one-file algorithms and those of the project
 folder. An algorithm's own methods ``q_values(observations, actions)``, ``log_prob(observations,
-actions)``, ``entropy(observations)``, ``value(observations)`` and ``intrinsic_reward(observations,
-actions, next_observations)`` are asked first; they get batches as the vector environment gives them
+actions)``, ``entropy(observations)``, ``value(observations)``, ``similarity(observations,
+actions)``, ``steps_to_goal(observations, actions)`` and ``intrinsic_reward(observations, actions,
+next_observations)`` are asked first; they get batches as the vector environment gives them
 and answer with one row per entry. Otherwise the networks of Stable-Baselines3's policies are asked.
 """
 
@@ -38,8 +39,12 @@ from scilab_rl.learning.observations import Tensors, batch_of_one
 from scilab_rl.metrics.probes import SECOND_CRITIC
 
 Q_VALUES, VALUE, LOG_PROB, ENTROPY = "q_values", "value", "log_prob", "entropy"
+SIMILARITY, STEPS_TO_GOAL = "similarity", "steps_to_goal"
 INTRINSIC_REWARD, GOALS = "intrinsic_reward", "goals"
 N_ENTROPY_SAMPLES = 128
+_OWN_METHODS = (
+    Q_VALUES, VALUE, LOG_PROB, ENTROPY, INTRINSIC_REWARD, SIMILARITY, STEPS_TO_GOAL,
+)  # fmt: skip
 
 Answer = np.ndarray | torch.Tensor
 # Vector wrappers whose observations are a function of the present ones alone, and that function.
@@ -114,8 +119,15 @@ class AgentInspector:
 
     def log_prob(self, observation: Observation, action: npt.ArrayLike) -> float:
         """Return log pi(a|s), a density in the algorithm's own units of actions."""
-        answer = self._ask[LOG_PROB](self._batch(observation), self._action(action))
-        return float(_numbers(answer).item())
+        return self._of_step(LOG_PROB, observation, action)
+
+    def similarity(self, observation: Observation, action: npt.ArrayLike) -> float:
+        """Return how similar a step and the desired goal are, f(s, a, g) of `jaxcrl`."""
+        return self._of_step(SIMILARITY, observation, action)
+
+    def steps_to_goal(self, observation: Observation, action: npt.ArrayLike) -> float:
+        """Return how many steps away the algorithm thinks that the desired goal is."""
+        return self._of_step(STEPS_TO_GOAL, observation, action)
 
     def entropy(self, observation: Observation) -> float:
         """Return the entropy of the policy in nats.
@@ -218,6 +230,10 @@ class AgentInspector:
         with self.undisturbed():
             return self._q_values(batch_of_one(observation), action[None]).shape[1]
 
+    def _of_step(self, quantity: str, observation: Observation, action: npt.ArrayLike) -> float:
+        answer = self._ask[quantity](self._batch(observation), self._action(action))
+        return float(_numbers(answer).item())
+
     def _q_values(self, batch: Observation, actions: np.ndarray) -> np.ndarray:
         return _numbers(self._ask[Q_VALUES](batch, actions))
 
@@ -281,7 +297,7 @@ def quantities_asked_directly(algorithm: object) -> frozenset[str]:
 def _methods(algorithm: object) -> dict[str, Callable[..., Answer]]:
     """Return how to ask for each quantity that the algorithm answers directly."""
     asked = _stable_baselines_methods(algorithm)
-    for quantity in (Q_VALUES, VALUE, LOG_PROB, ENTROPY, INTRINSIC_REWARD):
+    for quantity in _OWN_METHODS:
         if callable(own := getattr(algorithm, quantity, None)):
             asked[quantity] = own
     if (intrinsic := getattr(algorithm, "intrinsic", None)) is not None:
@@ -291,7 +307,7 @@ def _methods(algorithm: object) -> dict[str, Callable[..., Answer]]:
 
 def _derived(algorithm: Algorithm, asked: set[str]) -> set[str]:
     quantities = set()
-    if Q_VALUES in asked:
+    if Q_VALUES in asked and SIMILARITY not in asked:  # a similarity is not a return
         quantities.add(VALUE)
     if LOG_PROB in asked:
         quantities.add(ENTROPY)

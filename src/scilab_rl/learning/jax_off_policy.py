@@ -157,15 +157,16 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
         update: Callable[[S, State, Batch, Array, Array], tuple[State, Losses]],
         settings: S,
         state: State,
+        shown: Sequence[str] = ("actor", "critic"),
     ) -> None:
         """Compile the updates and make the replay buffer.
 
         Args:
             update: One gradient step, pure, see `UpdateRunner`.
             settings: Its first argument.
-            state: Weights and moments, with the entries ``actor`` and ``critic``.
+            state: Weights and moments.
+            shown: Its networks that act and answer.
         """
-        shown = ["actor", "critic"]
         self.rounds = UpdateRunner(partial(update, settings), state, shown, self._jax_device)
         self.make_replay_buffer()
 

@@ -12,6 +12,8 @@ take the place of Stable-Baselines3's ``HerReplayBuffer``, from which it differs
 * Goals may also be drawn from all episodes (``random``), and may change within an episode.
 * Goals may also be the desired goals of other episodes (``desired_share``), which keeps what is
   learned near what is asked for (Pitis et al., 2020, arXiv 2007.02832).
+* Goals may be drawn from the discounted future (``geometric``), and without rewards
+  (``goals_only``), as contrastive algorithms need them; see `jaxcrl`.
 * With a `relay`, half of each batch is of a goal that comes before the task's.
 * Episodes in which the achieved goal moved may be preferred (``moved_share``): where an object lies
   still, every goal of the episode is the same, and there is nothing to learn about pushing it. That
@@ -38,7 +40,7 @@ from scilab_rl.learning.goal_functions import goal_reward, goal_termination
 from scilab_rl.learning.relay import Relay
 from scilab_rl.relabeling import INFO_KEYS
 
-GOAL_STRATEGIES = ("future", "final", "episode", "random")
+GOAL_STRATEGIES = ("future", "geometric", "final", "episode", "random")
 # An achieved goal that stays within this range in every dimension has not moved (metres).
 _REST = 0.01
 # Rows of `HindsightReplayBuffer._cursors`.
@@ -97,12 +99,17 @@ class HindsightReplayBuffer(HerReplayBuffer):
         optimize_memory_usage: For Stable-Baselines3; the memory is small in either case.
         n_sampled_goal: Relabeled transitions per original one, k in the paper.
         goal_selection_strategy: Which goals are put in: ``future``, one that is reached from this
-            step on in the same episode; ``final``, the one reached at its end; ``episode``, any of
-            it; ``random``, any of all episodes. In the paper ``future`` does best, with k = 4 or 8.
+            step on in the same episode; ``geometric``, the one that is reached k steps later, with
+            a probability in proportion to discount^(k - 1); ``final``, the one reached at its end;
+            ``episode``, any of it; ``random``, any of all episodes. In the paper ``future`` does
+            best, with k = 4 or 8.
         moved_share: Share of transitions that are drawn only from episodes in which the achieved
             goal moved, once there are any; the others are drawn from all.
         desired_share: Share of relabeled transitions whose goal is the desired goal of a step that
             is drawn from all episodes, instead of one that was reached.
+        discount: How soon ``geometric`` goals are reached, between 0 and 1.
+        goals_only: Whether every transition is relabeled, with reward 0 and no ending: for
+            algorithms that learn from goals alone. The environment needs no ``compute_reward``.
         relay: The two goals of relay hindsight, see `Relay`; samples then end with its flag.
         info_keys: Numbers in the infos of steps that reward or ending depend on besides the goals.
         seed: Of the generator; None: drawn from NumPy's global one, which the run has seeded.
@@ -125,6 +132,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
         goal_selection_strategy: str = "future",
         moved_share: float = 0.0,
         desired_share: float = 0.0,
+        discount: float = 0.99,
+        goals_only: bool = False,
         relay: Relay | None = None,
         info_keys: Sequence[str] = (),
         seed: int | None = None,
@@ -133,6 +142,11 @@ class HindsightReplayBuffer(HerReplayBuffer):
         BaseBuffer.__init__(self, buffer_size, observation_space, action_space, device, n_envs)
         _check(observation_space, n_sampled_goal, goal_selection_strategy)
         _check_shares(moved_share=moved_share, desired_share=desired_share)
+        if goal_selection_strategy == "geometric" and not 0 < discount < 1:
+            raise ConfigError(
+                "Geometric goals need a discount (gamma) above 0 and below 1, but it is "
+                f"{discount}."
+            )
         n_rows = max(buffer_size // n_envs, _MIN_ROWS)
         self.buffer_size = n_rows
         self.env = env
@@ -142,14 +156,16 @@ class HindsightReplayBuffer(HerReplayBuffer):
         self.strategy = goal_selection_strategy
         self.moved_share = moved_share
         self.desired_share = desired_share
+        self.discount = discount
+        self.goals_only = goals_only
         self.relay = relay
         self.info_keys = tuple(info_keys)
-        self.her_ratio = 1 - 1 / (n_sampled_goal + 1)
+        self.her_ratio = 1.0 if goals_only else 1 - 1 / (n_sampled_goal + 1)
         self.random = np.random.default_rng(
             np.random.randint(2**31, size=4) if seed is None else seed
         )
 
-        self._columns = _columns(observation_space)
+        self._columns = entry_columns(observation_space)
         width = spaces.flatdim(observation_space)
         floats = np.issubdtype(action_space.dtype, np.floating)
         action_dtype = np.float32 if floats else action_space.dtype
@@ -304,6 +320,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
         self._end_episodes(np.ones(self.n_envs, bool))
 
     def _judge_by(self, env: VecEnv) -> None:
+        if self.goals_only:
+            return
         self._reward = goal_reward(env)
         self._termination = goal_termination(env)
 
@@ -354,6 +372,9 @@ class HindsightReplayBuffer(HerReplayBuffer):
         wanted, reached = self._columns["desired_goal"], self._columns["achieved_goal"]
         batch.observations[chosen, wanted] = goals
         batch.next_observations[chosen, wanted] = goals
+        if self.goals_only:
+            batch.rewards[chosen] = batch.terminated[chosen] = 0.0
+            return
         shape = (-1, *self.obs_shape["desired_goal"])
         achieved = batch.next_observations[chosen, reached].reshape(shape)
         pairs = achieved, goals.reshape(shape), self._infos(cells)
@@ -428,6 +449,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
             reached = self._later(cells, left)
         elif self.strategy == "future":
             reached = self._later(cells, self._draw_steps(left))
+        elif self.strategy == "geometric":
+            reached = self._later(cells, self._draw_discounted_steps(left))
         else:
             reached = self._later(cells, self._draw_steps(before + left) - before)
         goals = self._rows_at(reached)[:, self._columns["achieved_goal"]]
@@ -440,6 +463,12 @@ class HindsightReplayBuffer(HerReplayBuffer):
     def _draw_steps(self, most: np.ndarray) -> np.ndarray:
         """Draw numbers from 1 to ``most``."""
         return 1 + (self.random.random(len(most)) * most).astype(np.int64)
+
+    def _draw_discounted_steps(self, most: np.ndarray) -> np.ndarray:
+        """Draw numbers k from 1 to ``most`` with P(k) in proportion to discount^(k - 1)."""
+        chance = self.random.random(len(most)) * (1 - self.discount**most)
+        steps = 1 + (np.log1p(-chance) / np.log(self.discount)).astype(np.int64)
+        return np.minimum(steps, most)  # rounding
 
     def _rows_at(self, cells: np.ndarray) -> np.ndarray:
         return self.rows.reshape(-1, self.rows.shape[2]).take(cells, axis=0)
@@ -497,7 +526,7 @@ def _check(space: spaces.Space, n_sampled_goal: int, strategy: str) -> None:
         )
 
 
-def _columns(space: spaces.Dict) -> dict[str, slice]:
+def entry_columns(space: spaces.Dict) -> dict[str, slice]:
     """Return where each entry is in the vector of an observation."""
     columns, start = {}, 0
     for key, entry in space.spaces.items():

@@ -78,6 +78,12 @@ class Inspectable(Protocol):
     def entropy(self, observation: Observation) -> float:
         """The entropy of the policy, in nats."""
 
+    def similarity(self, observation: Observation, action: np.ndarray) -> float:
+        """How similar a step and the desired goal are."""
+
+    def steps_to_goal(self, observation: Observation, action: np.ndarray) -> float:
+        """How many steps away the desired goal is thought to be."""
+
     def intrinsic_reward(
         self, observation: Observation, action: np.ndarray, next_observation: Observation
     ) -> float:
@@ -188,6 +194,16 @@ def log_prob(inspector: Inspectable, observation: Observation, action: np.ndarra
     return inspector.log_prob(observation, action)
 
 
+def similarity(inspector: Inspectable, observation: Observation, action: np.ndarray) -> float:
+    """f(s, a, g): how similar a step and the desired goal are, to a contrastive critic."""
+    return inspector.similarity(observation, action)
+
+
+def steps_to_goal(inspector: Inspectable, observation: Observation, action: np.ndarray) -> float:
+    """How many steps away a contrastive critic thinks that the desired goal is."""
+    return inspector.steps_to_goal(observation, action)
+
+
 def reward(
     inspector: Inspectable, observation: Observation, action: np.ndarray, reward: float
 ) -> float:
@@ -255,6 +271,8 @@ _PROBES: dict[str, tuple[Callable[..., object], frozenset[str]]] = {
     "td_error": (td_error, frozenset({"value"})),
     "entropy": (entropy, frozenset({"entropy"})),
     "log_prob": (log_prob, frozenset({"log_prob"})),
+    "similarity": (similarity, frozenset({"similarity"})),
+    "steps_to_goal": (steps_to_goal, frozenset({"steps_to_goal"})),
     "reward": (reward, frozenset()),
     "return_so_far": (ReturnSoFar, frozenset()),
     "intrinsic_reward": (intrinsic_reward, frozenset({"intrinsic_reward"})),

@@ -506,7 +506,7 @@ def test_an_environment_without_a_reward_for_goals_is_refused() -> None:
 
 
 def test_wrong_settings_are_refused() -> None:
-    with pytest.raises(ConfigError, match=r"episode, final, future, random.*'final'\?"):
+    with pytest.raises(ConfigError, match=r"episode, final, future, geometric, random.*'final'\?"):
         make(goal_selection_strategy="fnal")
     with pytest.raises(ConfigError, match="n_sampled_goal must be at least 0, but it is -1"):
         make(n_sampled_goal=-1)
@@ -577,3 +577,34 @@ def test_preferring_what_does_not_exist_draws_from_all() -> None:
     assert len(buffer.sample_arrays(10).rewards) == 10
     with pytest.raises(ConfigError, match=r"moved_share must be from 0 to 1, but it is 1\.5"):
         make(moved_share=1.5)
+
+
+def test_geometric_goals_are_reached_in_discounted_time() -> None:
+    """P(k) is proportional to discount^(k - 1), up to the end of the episode."""
+    buffer = make(goal_selection_strategy="geometric", discount=0.5, n_sampled_goal=1e9)
+    record(buffer, [3])
+    columns = drawn(buffer, 30_000)
+    steps = columns["desired"] - columns["step"]
+    for step, chances in {0: [4 / 7, 2 / 7, 1 / 7], 1: [2 / 3, 1 / 3], 2: [1]}.items():
+        counts = np.unique(steps[columns["step"] == step], return_counts=True)[1]
+        np.testing.assert_allclose(counts / counts.sum(), chances, atol=0.02)
+        assert len(counts) == len(chances)
+
+
+def test_goals_alone_need_no_reward() -> None:
+    """Every transition is relabeled, and nothing asks the environment."""
+
+    class Silent(Line):
+        compute_reward = None  # type: ignore[assignment]
+
+    buffer = make(env=Silent, goal_selection_strategy="geometric", goals_only=True)
+    record(buffer, [3, 4], truncated=False)
+    columns = drawn(buffer)
+    assert columns["relabeled"].all()
+    assert not columns["reward"].any() and not columns["end"].any()
+
+
+@pytest.mark.parametrize("discount", [0.0, 1.0])
+def test_geometric_goals_need_a_discount(discount: float) -> None:
+    with pytest.raises(ConfigError, match="above 0 and below 1"):
+        make(goal_selection_strategy="geometric", discount=discount)
