@@ -40,6 +40,12 @@ class Mind:
     def log_prob(self, observation: Any, action: Any) -> float:
         return -1.5
 
+    def similarity(self, observation: Any, action: Any) -> float:
+        return -2.5
+
+    def steps_to_goal(self, observation: Any, action: Any) -> float:
+        return 12.0
+
     def entropy(self, observation: Any) -> float:
         return 0.25
 
@@ -54,7 +60,15 @@ class Mind:
 
 
 EVERYTHING = Mind(
-    "q_values", "value", "log_prob", "entropy", "intrinsic_reward", "goals", "second critic"
+    "q_values",
+    "value",
+    "log_prob",
+    "entropy",
+    "intrinsic_reward",
+    "goals",
+    "second critic",
+    "similarity",
+    "steps_to_goal",
 )
 
 
@@ -85,6 +99,8 @@ def ask(name: str, inspector: Mind = EVERYTHING, **changes: Any) -> dict[Curve, 
         ("td_error", {("td_error", ""): -1.0 + 0.5 * 10.0 - 3.0}),
         ("entropy", {("entropy", ""): 0.25}),
         ("log_prob", {("log_prob", ""): -1.5}),
+        ("similarity", {("similarity", ""): -2.5}),
+        ("steps_to_goal", {("steps_to_goal", ""): 12.0}),
         ("reward", {("reward", ""): -1.0}),
         ("train/rollout_rewards_step", {("train/rollout_rewards_step", ""): -1.0}),
         ("intrinsic_reward", {("intrinsic_reward", ""): 7.0}),
