@@ -15,7 +15,6 @@ import os
 import platform
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -39,7 +38,6 @@ from scilab_rl.run.provenance import PROVENANCE_FILE, fingerprint_of
 from scilab_rl.seeding import derive_seed
 
 if TYPE_CHECKING:  # heavy
-    from scilab_rl.envs.vec_step import ObservedStep
     from scilab_rl.training.evaluation import Episode
 
 CARD_FILE, PAGE_FILE = "card.json", "README.md"
@@ -48,20 +46,6 @@ _POLICY = "rl_model_finished"
 _SUCCESS, _RETURN = "eval/success_rate", "eval/mean_reward"
 _MOST_ROWS = 12  # of the curve on the page; the file has all
 _log = logging.getLogger(__name__)
-
-
-@dataclass
-class _Ends:
-    """Collects where each episode ended: an observer of steps."""
-
-    desired: list[np.ndarray] = field(default_factory=list)
-    achieved: list[np.ndarray] = field(default_factory=list)
-
-    def on_step(self, step: ObservedStep) -> None:
-        last = step.next_observations
-        if step.dones[0] and isinstance(last, dict) and "desired_goal" in last:
-            self.desired.append(last["desired_goal"][0].copy())
-            self.achieved.append(last["achieved_goal"][0].copy())
 
 
 def write_agent(
@@ -139,26 +123,26 @@ def measure(agent: RunDirectory, seeds: Sequence[int], n_episodes: int) -> dict[
         ``evaluation``: success and return with 95 % intervals, and the means of each seed;
         ``known_failures``: how and where episodes failed; ``fingerprint`` of the environment.
     """
-    from scilab_rl.envs.vectorize import observed_layer
     from scilab_rl.run.player import load_player
-    from scilab_rl.training.evaluation import Evaluation, evaluate
+    from scilab_rl.training.episode_goals import EpisodeGoals
+    from scilab_rl.training.evaluation import evaluate_seeds
 
-    env, model = load_player(
-        load_recorded(agent / CONFIG_FILE), find_policy(agent, "finished"), record=False
-    )
-    ends = _Ends()
-    observed_layer(env).observers.append(ends)
+    cfg, policy = load_recorded(agent / CONFIG_FILE), find_policy(agent, "finished")
+    env, model = load_player(cfg, policy, record=False, n_envs=len(seeds))
+    goals = EpisodeGoals(env)
     try:
-        shares = []
-        for seed in seeds:
-            _log.info("Seed %d: %d episodes ...", seed, n_episodes)
-            shares.append(evaluate(model, env, n_episodes, derive_seed(seed, "card")).episodes)
-        fingerprint = fingerprint_of(env.envs[0])  # type: ignore[attr-defined]
+        _log.info("%d episodes of each of the seeds %s ...", n_episodes, ", ".join(map(str, seeds)))
+        shares = evaluate_seeds(model, env, n_episodes, [derive_seed(s, "card") for s in seeds])
     finally:
         env.close()
-    episodes = [episode for share in shares for episode in share]
+    episodes = [episode for share in shares for episode in share.episodes]
+    # An environment that has waited for others has begun more.
+    desired, achieved = (
+        [goal for share in ends for goal in share[:n_episodes]]
+        for ends in (goals.desired, goals.achieved)
+    )
     knows_success = reports_success(agent)
-    values = [Evaluation(share).metrics(reports_success=knows_success) for share in shares]
+    values = [share.metrics(reports_success=knows_success) for share in shares]
     evaluation: dict[str, Any] = {
         "episodes": len(episodes),
         "seeds": list(seeds),
@@ -177,8 +161,10 @@ def measure(agent: RunDirectory, seeds: Sequence[int], n_episodes: int) -> dict[
         }
     return {
         "evaluation": evaluation,
-        "known_failures": _failures(episodes, ends, has_success=_SUCCESS in values[0]),
-        "fingerprint": fingerprint,
+        "known_failures": _failures(
+            episodes, np.array(desired), np.array(achieved), has_success=_SUCCESS in values[0]
+        ),
+        "fingerprint": _fingerprint(cfg),
     }
 
 
@@ -343,8 +329,25 @@ def _seconds(epochs: Sequence[Mapping[str, float]]) -> float:
     return sum(row.get(name, 0.0) for row in epochs for name in names)
 
 
-def _failures(episodes: Sequence[Episode], ends: _Ends, *, has_success: bool) -> dict[str, Any]:
-    """Return how episodes failed, and for goals where those lay that were not reached."""
+def _fingerprint(cfg: RunConfig) -> str | None:
+    from scilab_rl.envs.vectorize import make_eval_env
+    from scilab_rl.run.checks import complete
+
+    env = make_eval_env(complete(cfg))
+    try:
+        return fingerprint_of(env.envs[0])  # type: ignore[attr-defined]
+    finally:
+        env.close()
+
+
+def _failures(
+    episodes: Sequence[Episode], desired: np.ndarray, achieved: np.ndarray, *, has_success: bool
+) -> dict[str, Any]:
+    """Return how episodes failed, and for goals where those lay that were not reached.
+
+    Shapes:
+        desired, achieved: ``(n_episodes, n_dimensions)``, or nothing where there are no goals.
+    """
     if not has_success:
         returns = [sum(episode.rewards) for episode in episodes]
         return {
@@ -356,8 +359,7 @@ def _failures(episodes: Sequence[Episode], ends: _Ends, *, has_success: bool) ->
         "episodes": int(failed.sum()),
         "reached_and_left_again": sum(bool(e.success_once) and not e.success for e in episodes),
     }
-    if failed.any() and len(ends.desired) == len(episodes):
-        desired, achieved = np.array(ends.desired), np.array(ends.achieved)
+    if failed.any() and len(desired) == len(episodes):
         distances = np.linalg.norm(achieved - desired, axis=1)[failed]
         found["final_distance"] = {
             "mean": _rounded(distances.mean()), "highest": _rounded(distances.max()),

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import logging
 import pickle
-from collections.abc import Mapping, Sequence
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import gymnasium as gym
@@ -17,6 +18,7 @@ import numpy as np
 
 from scilab_rl.envs.contract import StepContract, is_finite
 from scilab_rl.envs.frames import FrameCapture
+from scilab_rl.envs.goal_setting import EpisodePlan, reset_with_goal
 from scilab_rl.envs.stability import UNSTABLE_KEY
 from scilab_rl.envs.types import Info, ResetResult, StepResult
 from scilab_rl.envs.wrapper_memory import Memory, memory_of, owned, set_memory, unknown_memory
@@ -54,9 +56,21 @@ class RunEnv(gym.Wrapper):
         self._generator_state: Mapping[str, object] | None = None
         self._actions: list[np.ndarray] = []
         self._memory: Memory = {}
+        self._plans: deque[EpisodePlan] = deque()
+
+    def plan_episodes(self, plans: Iterable[EpisodePlan]) -> None:
+        """Say how the next episodes begin, whoever resets; later ones begin as they are asked to.
+
+        Args:
+            plans: In order; they replace those that are left of an earlier call.
+        """
+        self._plans = deque(plans)
 
     def reset(self, *, seed: int | None = None, options: Info | None = None) -> ResetResult:
         """Begin an episode and remember how."""
+        if self._plans:
+            plan = self._plans.popleft()
+            seed, options = plan.seed, plan.options
         self._reset_arguments = {"seed": seed, "options": options}
         self._generator_state = None if seed is not None else self._generator.bit_generator.state
         self._actions = []
@@ -163,7 +177,7 @@ class RunEnv(gym.Wrapper):
 
     def _begin(self, seed: int | None, options: Info | None) -> ResetResult:
         try:
-            observation, info = self.env.reset(seed=seed, options=options)
+            observation, info = reset_with_goal(self.env, seed=seed, options=options)
             self._contract.check_reset(observation, info)
             observation, info = owned(observation), owned(info)
             self._frames.begin_episode(info)

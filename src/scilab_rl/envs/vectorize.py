@@ -54,9 +54,19 @@ def make_train_env(cfg: RunConfig, render_mode: str | None = None) -> VecEnv:
     return _make(cfg, "train", render_mode)
 
 
-def make_eval_env(cfg: RunConfig, render_mode: str | None = None) -> VecEnv:
-    """Make the single environment for evaluation, with its own stream of seeds."""
-    env = _make(for_evaluation(cfg), "eval", render_mode)
+def make_eval_env(cfg: RunConfig, render_mode: str | None = None, n_envs: int = 1) -> VecEnv:
+    """Make the environment for evaluation, with its own stream of seeds.
+
+    Args:
+        cfg: The configuration of the run.
+        render_mode: ``rgb_array`` or ``human`` when frames are wanted.
+        n_envs: More than one are stepped side by side, by threads where MuJoCo simulates them.
+    """
+    cfg = for_evaluation(cfg)
+    if n_envs > 1:
+        vector = "threads" if _is_simulated_by_mujoco(cfg) else "inprocess"
+        cfg = replace(cfg, n_envs=n_envs, vector=vector)
+    env = _make(cfg, "eval", render_mode)
     if (normalization := unwrap_vec_normalize(env)) is not None:
         normalization.training = normalization.norm_reward = False  # measure, don't adapt
     return env
@@ -135,6 +145,14 @@ def _make_in_thread(cfg: RunConfig, render_mode: str | None) -> gym.Env:
             "not. Use vector=workers or vector=inprocess."
         )
     return env
+
+
+def _is_simulated_by_mujoco(cfg: RunConfig) -> bool:
+    env = make_single_env(cfg)
+    try:
+        return simulator_state(env) is not None
+    finally:
+        env.close()
 
 
 def observed_layer(env: VecEnv) -> ObservedVecEnv:

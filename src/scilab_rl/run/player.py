@@ -21,17 +21,22 @@ if TYPE_CHECKING:  # heavy
 _SMALL_BUFFER = 1000
 
 
-def load_player(cfg: RunConfig, folder: Path, *, record: bool) -> tuple[VecEnv, Algorithm]:
+def load_player(
+    cfg: RunConfig, folder: Path, *, record: bool, n_envs: int = 1, buffer_size: int = _SMALL_BUFFER
+) -> tuple[VecEnv, Algorithm]:
     """Make the evaluation environment of a run and the algorithm with its saved weights.
 
     Args:
         cfg: The configuration of the run.
         folder: The saved policy.
         record: Whether its episodes are filmed.
+        n_envs: How many environments, side by side.
+        buffer_size: Most transitions of a replay buffer; a policy that only acts needs few.
     """
     cfg = complete(cfg)
     prepare_torch(cfg)
-    return _load(cfg, folder, render_mode("record" if record else "none"))
+    mode = render_mode("record" if record else "none")
+    return _load(cfg, folder, mode, n_envs, buffer_size)
 
 
 def measure_run(directory: RunDirectory, n_episodes: int) -> dict[str, float]:
@@ -56,14 +61,20 @@ def measure_run(directory: RunDirectory, n_episodes: int) -> dict[str, float]:
         env.close()
 
 
-def _load(cfg: RunConfig, folder: Path, render_mode: str | None) -> tuple[VecEnv, Algorithm]:
+def _load(
+    cfg: RunConfig,
+    folder: Path,
+    render_mode: str | None,
+    n_envs: int = 1,
+    buffer_size: int = _SMALL_BUFFER,
+) -> tuple[VecEnv, Algorithm]:
     from scilab_rl.envs.vectorize import make_eval_env
     from scilab_rl.training.policy import load_policy
 
-    env = make_eval_env(cfg, render_mode)
+    env = make_eval_env(cfg, render_mode, n_envs)
     arguments = dict(cfg.algorithm.arguments)
-    if "buffer_size" in arguments:  # a policy that only acts needs no large replay buffer
-        arguments["buffer_size"] = min(arguments["buffer_size"], _SMALL_BUFFER)
+    if "buffer_size" in arguments:
+        arguments["buffer_size"] = min(arguments["buffer_size"], buffer_size)
     algorithm = make_algorithm(
         replace(cfg, algorithm=replace(cfg.algorithm, arguments=arguments)), env
     )

@@ -1,0 +1,117 @@
+"""Beginning an episode with a chosen desired goal, in any environment with goals.
+
+Our own tasks take ``reset(options={"desired_goal": goal})``. Those of Gymnasium-Robotics and
+panda-gym draw the goal in ``_sample_goal``, which answers with the chosen one for one reset. Where
+there is only an attribute ``goal``, it is replaced after the reset, and so is the observation's.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import gymnasium as gym
+import numpy as np
+
+from scilab_rl.envs.goal import GoalEnv
+from scilab_rl.envs.types import Info, ResetResult
+from scilab_rl.errors import ConfigError
+
+OPTION = "desired_goal"
+
+
+class EpisodePlan(NamedTuple):
+    """How an episode begins.
+
+    Attributes:
+        seed: Of the reset; None: the environment's chance continues.
+        goal: The desired goal; None: the environment draws one. Shapes: ``(*goal_shape)``.
+    """
+
+    seed: int | None = None
+    goal: np.ndarray | None = None
+
+    @property
+    def options(self) -> Info | None:
+        """The options of the reset."""
+        return None if self.goal is None else {OPTION: self.goal}
+
+
+def reset_with_goal(env: gym.Env, *, seed: int | None, options: Info | None) -> ResetResult:
+    """Reset an environment, with the desired goal that the options name, if they name one.
+
+    Start states are those of the same seed without a chosen goal, wherever the environment draws
+    its goal last: the goal is drawn and then replaced.
+    """
+    chosen = None if options is None else options.get(OPTION)
+    owner = None if chosen is None else _goal_owner(env)
+    if owner is None:
+        return env.reset(seed=seed, options=options)
+    goal = np.asarray(chosen)
+    rest = {key: value for key, value in (options or {}).items() if key != OPTION} or None
+    if callable(getattr(owner, "_sample_goal", None)):
+        with _sampled(owner, goal):
+            return env.reset(seed=seed, options=rest)
+    observation, info = env.reset(seed=seed, options=rest)
+    owner.goal = goal.astype(owner.goal.dtype).reshape(owner.goal.shape)
+    if callable(show := getattr(owner, "update_target_site_pos", None)):
+        show()
+    return {**observation, OPTION: owner.goal.copy()}, info
+
+
+def refuse_goals_that_cannot_be_chosen(env: gym.Env, name: str) -> None:
+    """Try a chosen goal in an environment.
+
+    Args:
+        env: With all its wrappers.
+        name: The environment's, for messages.
+
+    Raises:
+        ConfigError: If it has no goals, or its goal cannot be chosen.
+    """
+    space = env.observation_space
+    if not isinstance(space, gym.spaces.Dict) or OPTION not in space.spaces:
+        raise ConfigError(
+            f"{name} has no goals: observations need achieved_goal and desired_goal, "
+            "such as those of FetchPush."
+        )
+    drawn = [np.asarray(env.reset(seed=seed)[0][OPTION]) for seed in (1, 2)]
+    goal = (0.25 * drawn[0] + 0.75 * drawn[1]).astype(drawn[0].dtype)
+    if np.array_equal(*drawn):  # always the same one
+        goal = (drawn[0] + np.asarray(1e-3)).astype(drawn[0].dtype)
+    first, _ = env.reset(seed=1, options={OPTION: goal})
+    second = env.step(env.action_space.sample())[0]
+    if not all(np.allclose(o[OPTION], goal, rtol=0, atol=1e-5) for o in (first, second)):
+        raise ConfigError(
+            f"The goals of {name} cannot be chosen: it takes neither reset(options="
+            "{'desired_goal': goal}) nor has it an attribute goal. scilab_rl.envs.goal.GoalEnv "
+            "takes the option."
+        )
+
+
+def _goal_owner(env: gym.Env) -> Any:
+    """Return the object whose goal must be replaced; None where the option does it all."""
+    inner: Any = env.unwrapped
+    if isinstance(inner, GoalEnv):
+        return None
+    for owner in (inner, getattr(inner, "task", None)):  # panda-gym's goal belongs to its task
+        if isinstance(getattr(owner, "goal", None), np.ndarray):
+            return owner
+    return None
+
+
+@contextlib.contextmanager
+def _sampled(owner: Any, goal: np.ndarray) -> Iterator[None]:
+    """Let an object's ``_sample_goal`` return this goal."""
+    original = owner._sample_goal
+
+    def sample_goal() -> np.ndarray:
+        drawn = np.asarray(original())  # so that later chance is the same
+        return goal.astype(drawn.dtype).reshape(drawn.shape)
+
+    owner._sample_goal = sample_goal
+    try:
+        yield
+    finally:
+        del owner._sample_goal
