@@ -17,7 +17,7 @@ from scilab_rl.analysis.estimates import Estimate, success_interval
 
 N_FOLDS = 5
 N_BINS = 8
-_N_SAMPLES = 1000
+_N_SAMPLES = 500
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,8 @@ def isotonic(values: np.ndarray, successes: np.ndarray, at: np.ndarray) -> np.nd
     Shapes:
         values, successes: ``(n,)``; at, result: ``(m,)``.
 
-    >>> isotonic(np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0]), np.array([0.5, 3.0])).tolist()
+    >>> values, successes = np.array([0.0, 1.0, 2.0]), np.array([0.0, 1.0, 0.0])
+    >>> isotonic(values, successes, np.array([0.5, 3.0])).tolist()
     [0.25, 0.5]
     """
     from scipy import optimize  # heavy

@@ -13,7 +13,7 @@ import numpy as np
 from scilab_rl.errors import ConfigError
 
 MOST_AXES = 3
-DEFAULT_CELLS = {1: 45, 2: 15, 3: 9}
+DEFAULT_CELLS = {1: (45,), 2: (15, 15), 3: (9, 9, 3)}
 _FIXED = 1e-6  # of the largest range: a dimension that varies less is fixed
 
 
@@ -47,7 +47,9 @@ class GoalSpace:
         """
         free, follows = free_dimensions(drawn)
         if not free:
-            raise ConfigError("The desired goals do not vary, so there is no goal space to examine.")
+            raise ConfigError(
+                "The desired goals do not vary, so there is no goal space to examine."
+            )
         ranges = np.ptp(drawn, axis=0)
         if axes is None:
             widest = sorted(sorted(free, key=lambda d: -ranges[d])[:2])
@@ -98,10 +100,24 @@ class Grid:
     edges: tuple[np.ndarray, ...]
 
     @classmethod
-    def over(cls, space: GoalSpace, n_cells: int) -> Grid:
-        """Divide each axis into this many cells."""
-        ends = zip(space.low, space.high, strict=True)
-        return cls(tuple(np.linspace(low, high, n_cells + 1) for low, high in ends))
+    def over(cls, space: GoalSpace, n_cells: Sequence[int] | None = None) -> Grid:
+        """Divide the axes into cells.
+
+        Args:
+            space: The goals.
+            n_cells: On each axis; None: about 225 altogether.
+
+        Raises:
+            ConfigError: If there is not one number for each axis.
+        """
+        n_cells = n_cells or DEFAULT_CELLS[len(space.axes)]
+        if len(n_cells) != len(space.axes):
+            raise ConfigError(
+                f"--cells needs one number for each of the axes {', '.join(map(str, space.axes))}, "
+                f"but it is {','.join(map(str, n_cells))}."
+            )
+        ends = zip(space.low, space.high, n_cells, strict=True)
+        return cls(tuple(np.linspace(low, high, n + 1) for low, high, n in ends))
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -142,7 +158,7 @@ class Grid:
             while waiting:
                 cell = waiting.popleft()
                 region.append(cell)
-                near = [n for n in self._neighbors(cell) if n in left]
+                near = [n for n in self.neighbors(cell) if n in left]
                 left.difference_update(near)
                 waiting.extend(near)
             found.append(np.array(sorted(region)))
@@ -156,7 +172,13 @@ class Grid:
             for edges, index in zip(self.edges, places, strict=True)
         ]
 
-    def _neighbors(self, cell: int) -> list[int]:
+    def random_places(self, cells: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Return a place in each of some cells. Shapes: ``(n,)``; result ``(n, n_axes)``."""
+        sizes = np.array([edges[1] - edges[0] for edges in self.edges])
+        return self.centers[cells] + sizes * rng.uniform(-0.5, 0.5, (len(cells), len(sizes)))
+
+    def neighbors(self, cell: int) -> list[int]:
+        """Return the cells that share a side with one."""
         place = np.array(np.unravel_index(cell, self.shape))
         near = []
         for axis, step in itertools.product(range(len(place)), (-1, 1)):

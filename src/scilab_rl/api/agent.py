@@ -42,9 +42,6 @@ if TYPE_CHECKING:  # heavy
     from scilab_rl.learning.inspector import AgentInspector
     from scilab_rl.training.evaluation import Episode, Evaluation
 
-# By default, the first supported metric of each row is drawn.
-_DEFAULT_METRICS = (("q_values", "value"), ("critic_variance",), ("goal_distance",), ("reward",))
-
 
 def load(
     run: str | Path = "last",
@@ -395,7 +392,7 @@ class Agent:
     ) -> Callable[[], Replay]:
         """Prepare the recording of the next episode and return the function that ends it."""
         from scilab_rl.learning.inspector import AgentInspector
-        from scilab_rl.recording.callback import film_first_episode
+        from scilab_rl.recording.callback import default_metrics, film_first_episode
         from scilab_rl.recording.records import FOLDER, SUFFIX, ClipInfo
         from scilab_rl.training.checkpoint import saved_step
 
@@ -416,13 +413,6 @@ class Agent:
             return Replay(folder / f"{clip.name}.html")
 
         return finish
-
-
-def default_metrics(inspector: AgentInspector) -> list[str]:
-    """Return the most informative metrics that an algorithm supports."""
-    possible = answerable(inspector)
-    chosen = (next((name for name in row if name in possible), None) for row in _DEFAULT_METRICS)
-    return [name for name in chosen if name is not None]
 
 
 def as_batch(observation: Observation, space: Any) -> tuple[Any, bool]:

@@ -33,6 +33,7 @@ COMMANDS = {
     "compare": "compare algorithms, groups or runs: which learns better",
     "experiment": "train the missing runs of a comparison, then compare",
     "performance": "test whether everything still learns as well as before",
+    "goals": "map where in its goal space an agent fails, and what it expects",
     "export": "write observations, actions and metrics of an agent as a table",
     "mlflow": "browse the learning curves of all runs with MLflow",
     "sync": "send runs to a tracker that was unavailable while they trained",

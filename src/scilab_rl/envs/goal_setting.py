@@ -16,7 +16,6 @@ import numpy as np
 
 from scilab_rl.envs.goal import GoalEnv
 from scilab_rl.envs.types import Info, ResetResult
-from scilab_rl.errors import ConfigError
 
 OPTION = "desired_goal"
 
@@ -58,36 +57,6 @@ def reset_with_goal(env: gym.Env, *, seed: int | None, options: Info | None) -> 
     if callable(show := getattr(owner, "update_target_site_pos", None)):
         show()
     return {**observation, OPTION: owner.goal.copy()}, info
-
-
-def refuse_goals_that_cannot_be_chosen(env: gym.Env, name: str) -> None:
-    """Try a chosen goal in an environment.
-
-    Args:
-        env: With all its wrappers.
-        name: The environment's, for messages.
-
-    Raises:
-        ConfigError: If it has no goals, or its goal cannot be chosen.
-    """
-    space = env.observation_space
-    if not isinstance(space, gym.spaces.Dict) or OPTION not in space.spaces:
-        raise ConfigError(
-            f"{name} has no goals: observations need achieved_goal and desired_goal, "
-            "such as those of FetchPush."
-        )
-    drawn = [np.asarray(env.reset(seed=seed)[0][OPTION]) for seed in (1, 2)]
-    goal = (0.25 * drawn[0] + 0.75 * drawn[1]).astype(drawn[0].dtype)
-    if np.array_equal(*drawn):  # always the same one
-        goal = (drawn[0] + np.asarray(1e-3)).astype(drawn[0].dtype)
-    first, _ = env.reset(seed=1, options={OPTION: goal})
-    second = env.step(env.action_space.sample())[0]
-    if not all(np.allclose(o[OPTION], goal, rtol=0, atol=1e-5) for o in (first, second)):
-        raise ConfigError(
-            f"The goals of {name} cannot be chosen: it takes neither reset(options="
-            "{'desired_goal': goal}) nor has it an attribute goal. scilab_rl.envs.goal.GoalEnv "
-            "takes the option."
-        )
 
 
 def _goal_owner(env: gym.Env) -> Any:

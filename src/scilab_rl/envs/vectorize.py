@@ -64,8 +64,8 @@ def make_eval_env(cfg: RunConfig, render_mode: str | None = None, n_envs: int = 
     """
     cfg = for_evaluation(cfg)
     if n_envs > 1:
-        vector = "threads" if _is_simulated_by_mujoco(cfg) else "inprocess"
-        cfg = replace(cfg, n_envs=n_envs, vector=vector)
+        cfg = replace(cfg, n_envs=n_envs)
+        cfg = replace(cfg, vector="threads") if _is_simulated_by_mujoco(cfg) else cfg
     env = _make(cfg, "eval", render_mode)
     if (normalization := unwrap_vec_normalize(env)) is not None:
         normalization.training = normalization.norm_reward = False  # measure, don't adapt

@@ -30,6 +30,8 @@ from scilab_rl.training.loop import Trainer
 
 _log = logging.getLogger(__name__)
 RECORD, DISPLAY = "record", "display"
+# By default, the first supported metric of each row is drawn.
+_DEFAULT_METRICS = (("q_values", "value"), ("critic_variance",), ("goal_distance",), ("reward",))
 _FOR_TRACKERS = (".mp4", ".html")
 
 
@@ -162,6 +164,13 @@ def _shown_metrics(
         hint=lambda metric: how_to_declare(type(inspector.algorithm), metric),
     )
     return train_metrics, of_evaluation("render_metrics_test", [*cfg.render_metrics_test, *watched])
+
+
+def default_metrics(inspector: AgentInspector) -> list[str]:
+    """Return the most informative metrics that an algorithm supports."""
+    possible = answerable(inspector)
+    chosen = (next((name for name in row if name in possible), None) for row in _DEFAULT_METRICS)
+    return [name for name in chosen if name is not None]
 
 
 def film_first_episode(

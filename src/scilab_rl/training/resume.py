@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Mapping
 from pathlib import Path
@@ -67,6 +68,15 @@ def save(snapshot: Snapshot, run_dir: Path, step: int) -> Path:
     fault_point("checkpoint.before_forgetting")
     _forget(run_dir, older_than=directory)
     return directory
+
+
+def newest_checkpoint(run_dir: Path) -> Path | None:
+    """Return the newest checkpoint that is whole; None: there is none."""
+    for directory in _generations(run_dir):
+        with contextlib.suppress(CheckpointError):
+            checkpoint.verify(directory)
+            return directory
+    return None
 
 
 def load_latest(run_dir: Path) -> tuple[Snapshot, int]:
