@@ -51,6 +51,7 @@ BENCHMARKS = {
     "showing": Benchmark(("showing.py",), "live view and recording", 5, ()),
     "study": Benchmark(("study.py",), "how busy a study keeps its workers", 4),
     "decisions": Benchmark(("decisions.py",), "what a study does next, with 10,000 runs", 3),
+    "board": Benchmark(("board.py",), "the board of 1,000 runs: size, time to open", 1),
     "metrics": Benchmark(("load.py", "metrics"), "values recorded per second", 1),
     "reach": Benchmark(("time_to_success.py", "reach"), "time until FetchReach is mastered", 40),
     "push": Benchmark(("time_to_success.py", "push"), "time until FetchPush is mastered", 50),

@@ -24,6 +24,7 @@ COMMANDS = {
     "resume": "continue an interrupted run",
     "new": "create an algorithm of your own from an existing one",
     "runs": "list the recorded runs",
+    "board": "all runs and studies on one page, in a browser",
     "plot": "draw the learning curves of runs, here or as a picture",
     "note": "write a note to a run",
     "tag": "give a run tags, by which it is found again",

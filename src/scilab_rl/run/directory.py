@@ -320,6 +320,5 @@ def reports_success(run: RunDirectory) -> bool:
 
 def read_epochs(run: RunDirectory) -> list[dict[str, Any]]:
     """Return the rows of ``metrics.jsonl`` that describe evaluations, oldest first."""
-    return [
-        row for row in files.read_json_lines(run / "metrics.jsonl") if row.get("kind") == "epoch"
-    ]
+    rows = files.read_json_lines(run / "metrics.jsonl", containing='"epoch"')
+    return [row for row in rows if row.get("kind") == "epoch"]
