@@ -112,7 +112,9 @@ def commands_page() -> Iterator[str]:
     """Yield the help of the command line and of each sub-command."""
     yield "# Commands\n"
     yield "`python src/main.py` and `scilab-rl` are the same program.\n"
-    yield from fenced("console", f"$ scilab-rl --help\n{help_of()}")
+    yield from fenced(
+        "console", f"$ scilab-rl --help\n{help_of()}\n$ scilab-rl --help all\n{help_of('all')}"
+    )
     for command, meaning in COMMANDS.items():
         yield f"## {command}\n"
         yield f"{meaning[0].upper()}{meaning[1:]}.\n"
@@ -312,7 +314,8 @@ def help_of(command: str | None = None) -> str:
     os.environ["COLUMNS"] = "80"
     try:
         with contextlib.redirect_stdout(printed), contextlib.suppress(SystemExit):
-            run_command_line([command, "--help"] if command else ["--help"])
+            words = ["--help", "all"] if command == "all" else [command or "", "--help"]
+            run_command_line([word for word in words if word])
     finally:
         os.environ.pop("COLUMNS") if width is None else os.environ.update(COLUMNS=width)
     return printed.getvalue()

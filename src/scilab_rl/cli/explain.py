@@ -116,7 +116,7 @@ def _leaves(key: str, final: Mapping[str, object]) -> list[str]:
     if not leaves:
         raise ConfigError(
             f"There is no key '{key}'.{did_you_mean(key, final)} `scilab-rl explain algorithm` "
-            "shows the algorithm's keys, `scilab-rl --help` all others."
+            "shows the algorithm's keys, `scilab-rl --help all` all others."
         )
     return leaves
 

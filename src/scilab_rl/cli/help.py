@@ -1,4 +1,4 @@
-"""``scilab-rl --help``: all commands, keys and flags. No heavy import, so that it is instant."""
+"""``scilab-rl --help`` and ``--help all``. No heavy import, so that both are instant."""
 
 from __future__ import annotations
 
@@ -33,6 +33,23 @@ _FLAGS = (
     ("--version", "show the version"),
     ("--help, -h", "show this; `scilab-rl COMMAND --help` shows the options of a command"),
 )
+_FIRST_LINES = (
+    ("scilab-rl env=FetchReach algorithm=jaxsac", "train"),
+    ("scilab-rl play last --record", "film what was learned"),
+    ("scilab-rl view last", "look inside, step by step"),
+    ("scilab-rl COMMAND --help", "options of a command"),
+)
+# Commands by purpose; others follow in the last row.
+_PURPOSES = {
+    "Watch": ("play", "view", "goals", "whatif", "probe", "human"),
+    "Runs": ("runs", "board", "plot", "resume", "note", "tag", "delete"),
+    "Compare": ("experiment", "compare", "study", "performance", "fit", "recover"),
+    "Change": ("new", "algorithms", "envs", "explain", "profile"),
+    "Data": ("export", "mlflow", "sync"),
+}
+_FIRST_KEYS = (
+    "env", "n_epochs", "eval_after_n_steps", "seed", "n_envs", "render", "restore_policy",
+)  # fmt: skip
 _WIDEST, _LEFT = 100, 32
 
 
@@ -46,6 +63,37 @@ def print_help(commands: Mapping[str, str]) -> None:
     for line in _lines(commands, width):
         write(line)
     sys.stdout.flush()
+
+
+def print_short_help(commands: Mapping[str, str]) -> None:
+    """Print what is needed first, in at most 30 lines of 80 columns.
+
+    Args:
+        commands: The sub-commands and their purposes.
+    """
+    width = min(_WIDEST, shutil.get_terminal_size((_WIDEST, 24)).columns)
+    for line in _short_lines(commands, width):
+        write(line)
+    sys.stdout.flush()
+
+
+def _short_lines(commands: Mapping[str, str], width: int) -> Iterable[str]:
+    yield from textwrap.wrap("Train robots and other agents by reinforcement learning.", width)
+    yield ""
+    for words, meaning in _FIRST_LINES:
+        yield f"  {words:<44}{meaning}"
+    sorted_out = {name for names in _PURPOSES.values() for name in names}
+    others = tuple(name for name in commands if name not in sorted_out)
+    yield from ("", "Commands")
+    for purpose, row in {**_PURPOSES, "Other": others}.items():
+        yield f"  {purpose:<10}{', '.join(name for name in row if name in commands)}"
+    keys = [key for key in KEYS if key.name in _FIRST_KEYS]
+    facts = [(f"{key.name}={as_typed(key.default)}", key.meaning) for key in keys]
+    yield from _section("Keys that are needed first", facts, width)
+    yield ""
+    yield from textwrap.wrap(
+        "Everything: scilab-rl --help all. The values of a run: scilab-rl ... --cfg job", width
+    )
 
 
 def _lines(commands: Mapping[str, str], width: int) -> Iterable[str]:

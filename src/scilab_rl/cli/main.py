@@ -134,9 +134,12 @@ def _dispatch(arguments: list[str]) -> int:
         module = importlib.import_module(f"scilab_rl.cli.{first}")
         return int(module.main(arguments[1:]) or 0)
     if first in ("-h", "--help"):
-        from scilab_rl.cli.help import print_help
+        from scilab_rl.cli.help import print_help, print_short_help
 
-        print_help(COMMANDS)
+        if arguments[1:2] == ["all"]:
+            print_help(COMMANDS)
+        else:
+            print_short_help(COMMANDS)
         return 0
     if first and not first.startswith(("-", "~")) and "=" not in first and first != "train":
         if first.lstrip("+") in config_keys():
@@ -157,7 +160,7 @@ def _refuse_unknown_flags(arguments: Sequence[str]) -> None:
             words = [*_HYDRA_FLAGS, *config_keys()]
             raise ConfigError(
                 f"There is no flag '{flag}'.{did_you_mean(flag.lstrip('-'), words)} Keys are given "
-                "without dashes, as in n_epochs=3; `scilab-rl --help` lists keys and flags."
+                "without dashes, as in n_epochs=3; `scilab-rl --help all` lists keys and flags."
             )
     _refuse_bad_values_of_flags(arguments)
 

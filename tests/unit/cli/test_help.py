@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from scilab_rl.cli.help import print_help
+from scilab_rl.cli.help import print_help, print_short_help
 from scilab_rl.cli.main import COMMANDS
 from scilab_rl.config.schema import ALIASES, KEYS
 
@@ -73,6 +73,16 @@ def test_flags_are_explained(text, flag):
     assert f"  {flag}" in text
 
 
+def test_the_short_help_names_all_commands_on_one_screen(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "80")
+    print_short_help(COMMANDS)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) <= 30 and max(map(len, lines)) <= 80
+    named = {word.strip(",") for line in lines for word in line.split()}
+    assert set(COMMANDS) <= named
+    assert "--help all" in lines[-1]
+
+
 @pytest.mark.parametrize("columns", [20, 80])
 def test_lines_fit_the_terminal(capsys, monkeypatch, columns):
     monkeypatch.setenv("COLUMNS", str(columns))
@@ -85,7 +95,7 @@ def test_lines_fit_the_terminal(capsys, monkeypatch, columns):
 def test_help_is_quick_and_imports_nothing_heavy(tmp_path):
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     done = subprocess.run(
-        [sys.executable, "-X", "importtime", str(MAIN), "--help"],
+        [sys.executable, "-X", "importtime", str(MAIN), "--help", "all"],
         cwd=tmp_path,
         env=os.environ | {"OMP_NUM_THREADS": "1"},
         capture_output=True,
