@@ -41,6 +41,7 @@ COMMANDS = {
     "algorithms": "list the algorithms",
     "envs": "list the environments",
     "explain": "show which file or layer sets the value of a key",
+    "completion": "let the Tab key complete commands, keys and runs",
     "clean": "remove what killed processes left behind",
     "doctor": "check the installation and how to repair it",
 }
