@@ -25,7 +25,7 @@ MODELS = (
 # Modules that are imported only where their package is known to be installed, or for its users.
 BEHIND_AN_EXTRA = {
     "learning/jax_engine.py", "learning/jax_off_policy.py",
-    "algorithms/jaxsac.py", "algorithms/jaxtd3.py", "learning/cognitive.py",
+    "algorithms/jaxcrl.py", "algorithms/jaxsac.py", "algorithms/jaxtd3.py", "learning/cognitive.py",
     *(f"algorithms/models/{name}.py" for name in MODELS),
     "envs/suites/highway_env.py", "envs/suites/metaworld.py", "envs/suites/panda_gym.py",
     "testing/algorithms.py", "testing/models.py",
