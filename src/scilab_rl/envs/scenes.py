@@ -46,6 +46,8 @@ class Snapshot:
         state: MuJoCo's state, see `frames.simulator_state`.
         derived: Its other arrays, by name.
         warnings: Its counters of warnings.
+        sites: Where the model has its sites, which renderers move to mark goals. Shapes:
+            ``(n_sites, 3)``.
         attributes: Of each layer of the environment, by name, see `wrapper_memory.describe`.
         memory: Of the wrappers.
     """
@@ -53,6 +55,7 @@ class Snapshot:
     state: np.ndarray
     derived: dict[str, np.ndarray]
     warnings: np.ndarray
+    sites: np.ndarray
     attributes: list[dict[str, object]]
     memory: Memory
 
@@ -62,11 +65,12 @@ def take_snapshot(env: gym.Env) -> Snapshot | None:
     state = simulator_state(env)
     if state is None:
         return None
-    data: Any = env.unwrapped.data  # type: ignore[attr-defined]
+    inner: Any = env.unwrapped
+    data = inner.data
     derived = {name: np.array(getattr(data, name)) for name in _derived_names(data)}
     attributes = [_plain_attributes(layer) for layer in _layers(env)]
-    warnings = np.array(data.warning.number)
-    return Snapshot(state, derived, warnings, attributes, memory_of(env))
+    warnings, sites = np.array(data.warning.number), inner.model.site_pos.copy()
+    return Snapshot(state, derived, warnings, sites, attributes, memory_of(env))
 
 
 def put_snapshot(env: gym.Env, snapshot: Snapshot) -> None:
@@ -77,8 +81,10 @@ def put_snapshot(env: gym.Env, snapshot: Snapshot) -> None:
         for name, description in attributes.items():
             setattr(layer, name, rebuilt(description, own.get(name)))
     set_simulator_state(env, snapshot.state)
-    data: Any = env.unwrapped.data  # type: ignore[attr-defined]
+    inner: Any = env.unwrapped
+    data = inner.data
     data.warning.number[:] = snapshot.warnings
+    inner.model.site_pos[:] = snapshot.sites
     for name, values in snapshot.derived.items():
         if (array := getattr(data, name)).shape == values.shape:
             array[...] = values
