@@ -85,7 +85,7 @@ docs: $(VENV)/.installed  ## build the documentation into site/
 docs-figures: $(VENV)/.installed  ## draw the figures of the documentation
 	$(BIN)/python -m docs.figures
 
-gallery: setup  ## film every family of environments and algorithms, see docs/gallery.md (about 20 minutes)
+gallery: setup  ## film the trained agents, see docs/gallery.md (about three minutes)
 	$(BIN)/python docs/figures/gallery.py
 
 figure-fetchpush: setup  ## the paper's figure: critic variance while the block falls (about 10 minutes)

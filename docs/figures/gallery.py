@@ -1,30 +1,33 @@
-"""Film every family of environments and of algorithms: ``make gallery``.
+"""Film the trained agents of the package: ``make gallery``.
 
-Replay pages and videos go to data/gallery/, a picture of each to docs/images/gallery/. Environments
-are shown with random actions; algorithms after a training of a minute, which is not their best.
+``docs/images/hero.webp`` is an episode of FetchPickAndPlace with its curves;
+``docs/images/gallery/`` has a looping card of each agent. Videos and replay pages stay in
+data/agents/NAME/episodes/.
 """
 
 from __future__ import annotations
 
-import shutil
 import sys
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from PIL import Image
 
-from scilab_rl.cli.main import run_command_line
-from scilab_rl.recording.movie import MovieFrames
-from scilab_rl.recording.records import load_clip
+from scilab_rl.api.agent import load
+from scilab_rl.drawing import BACKGROUND
+from scilab_rl.metrics.probes import Observation
+from scilab_rl.recording.movie import MovieFrames, PanelSheet
+from scilab_rl.recording.records import Clip, Record, decode_picture, load_clip
 
-FILMS = Path("data/gallery")
-PICTURES = Path(__file__).parents[1] / "images" / "gallery"
-WIDTH = 720  # pixels of a picture
-RANDOM = ("algorithm=random", "n_epochs=1", "eval_after_n_steps=20", "n_test_rollouts=1")
-TRAINED = ("n_test_rollouts=3", "early_stop_threshold=2", "seed=1")
-GOALS = "goal_distance,reward,action"
-NO_GOALS = "reward,return_so_far,action"
+IMAGES = Path(__file__).parents[1] / "images"
+CARDS = IMAGES / "gallery"
+CARD = 360  # pixels, of its width and of the scene's height
+PANEL = 108
+MOST_SCENES = 60
+FRAME, LAST = 100, 2200  # milliseconds
+NEAR, CLOSED = 0.03, 0.06  # metres from gripper to block; between fingers that hold one of 0.05
 
 
 @dataclass(frozen=True)
@@ -32,103 +35,101 @@ class Film:
     """One entry of the gallery.
 
     Attributes:
-        name: Of its files.
-        words: What is trained, and where.
-        metrics: What is drawn beside it.
-        frames: Scenes of the clip; 0 means an episode.
+        agent: Name of the trained agent.
+        seed: Of the episode.
+        panel: The curve of its card.
+        n_scenes: How many, from the first on.
     """
 
-    name: str
-    words: tuple[str, ...]
-    metrics: str
-    frames: int = 0
+    agent: str
+    seed: int
+    panel: str = "q_values"
+    n_scenes: int = MOST_SCENES
 
 
-def by_chance(name: str, env: str, metrics: str = GOALS) -> Film:
-    """Return the film of an environment with random actions."""
-    return Film(f"env_{name}", (*RANDOM, f"env={env}"), metrics, frames=40)
-
-
-def trained(name: str, env: str, metrics: str, *words: str) -> Film:
-    """Return the film of an algorithm after a short training."""
-    return Film(f"algorithm_{name}", (*TRAINED, f"algorithm={name}", f"env={env}", *words), metrics)
-
-
-SHORT = (
-    "n_epochs=2", "eval_after_n_steps=250", "tuned=false", "algorithm.learning_rate=1e-3",
-    "algorithm.gamma=0.95", "algorithm.batch_size=64",
-)  # fmt: skip
-SMALL = (*SHORT, "algorithm.net_arch=[64,64]")
-SMALL_SB3 = (*SHORT, "algorithm.policy_kwargs.net_arch=[64,64]")
-REACH = "Reach1DOF-v0"
-Q = "q_values,critic_variance,goal_distance,reward"
 FILMED = (
-    by_chance("fetch", "FetchPickAndPlace-v4"),
-    by_chance("reach1dof", REACH),
-    by_chance("blocks", "Blocks-o2-gripper_above-v1"),
-    by_chance("hook", "Hook-o2-v1"),
-    by_chance("button_unlock", "ButtonUnlock-o2-v1"),
-    by_chance("point", "PointGym-sparse-0.5-medium_custom_dgr-c1-rt0-s500-v0"),
-    by_chance("point_objects", "PointObjGym-sparse-o4-0.5-small_open_dgr-c1-rt0-s300-v0"),
-    by_chance("ant", "AntGym-sparse-10-1.5-small_open_dgr-c1-rt0-s500-v0", "goal_distance,reward"),
-    by_chance("hand", "HandReach-v3", "goal_distance,reward"),
-    by_chance("parking", "parking-limited-v0"),
-    by_chance("metaworld", "MetaW-drawer-close-v3", NO_GOALS),
-    by_chance("walkers", "HalfCheetah-v5", NO_GOALS),
-    by_chance("box2d", "LunarLander-v3", NO_GOALS),
-    by_chance("classic", "CartPole-v1", NO_GOALS),
-    trained("sac", REACH, Q, *SMALL_SB3),
-    trained("td3", REACH, Q, *SMALL_SB3),
-    trained("cleansac", REACH, Q, *SMALL),
-    trained("jaxsac", REACH, Q, *SMALL),
-    trained("sac_var", REACH, Q, *SMALL),
-    trained("cleansacmc", REACH, "q_value,intrinsic_reward,goal_distance", *SMALL),
-    trained("actor_critic", REACH, "q_value,goal_distance,reward", *SHORT),
-    trained("dqn", "CartPole-v1", "q_value,td_error,action", "n_epochs=2",
-            "eval_after_n_steps=2000"),
-    trained("cleanppo", "CartPole-v1", "value,entropy,action", "n_epochs=2",
-            "eval_after_n_steps=4000", "n_envs=4", "algorithm.n_steps=128"),
+    Film("FetchPickAndPlace", 5, n_scenes=26), Film("FetchPush", 13, n_scenes=34),
+    Film("FetchSlide", 4, n_scenes=44), Film("Blocks1", 3, n_scenes=26),
+    Film("FetchReach", 3, "critic_variance", n_scenes=16), Film("Reach1DOF", 3, n_scenes=16),
+    Film("CartPole", 3, "value"),
 )  # fmt: skip
+# The robot knocks the block off the table, where it is caught at its base, and goes after it.
+HERO = Film("FetchPickAndPlace", 3, n_scenes=50)
 
 
-def make(film: Film) -> None:
-    """Train, film, and keep the picture of the middle of the last clip.
+def record(film: Film, metrics: Sequence[str]) -> Clip:
+    """Let an agent act for an episode and return it, seen from near."""
+    with load(f"agent:{film.agent}") as agent:
+        agent.cfg = replace(agent.cfg, render_view="close")
+        clip = load_clip(agent.record(metrics, seed=film.seed).recording)
+    clip.records = clip.records[: film.n_scenes]
+    return clip
 
-    Raises:
-        RuntimeError: If the run has failed.
+
+def mark_grasp(clip: Clip) -> None:
+    """Add an event where the grasp begins that ends in success.
+
+    Of Fetch's observation, elements 6 to 8 are the block's place relative to the gripper, 9 and 10
+    how far its fingers are open.
     """
-    words = (
-        *film.words, "mlflow=0", f"base_logdir={FILMS / 'runs'}", "render=record", "render_freq=1",
-        "render_metrics_train=[]", f"render_metrics_test=[{film.metrics}]",
-        f"render_frames_per_clip={film.frames}",
+    seen = np.array([_vector(record.observation) for record in clip.records])
+    holds = (np.linalg.norm(seen[:, 6:9], axis=1) < NEAR) & (seen[:, 9:11].sum(axis=1) < CLOSED)
+    solved = next(index for index, record in enumerate(clip.records) if record.success)
+    loose = np.flatnonzero(~holds[: solved + 1])
+    clip.records[int(loose[-1]) + 1].events.append("grasp")
+
+
+def make_hero() -> None:
+    """Film the hero of README and site."""
+    clip = record(HERO, ("q_values", "goal_distance", "reward"))
+    mark_grasp(clip)
+    save([Image.fromarray(frame) for frame in MovieFrames(clip)], IMAGES / "hero.webp")
+
+
+def make_card(film: Film) -> None:
+    """Film an agent: the scene, and below it one curve."""
+    clip = record(film, (film.panel,))
+    sheet = PanelSheet(clip, CARD, PANEL)
+    frames = []
+    for index, scene in enumerate(clip.records):
+        frame = Image.new("RGB", (CARD, CARD + PANEL), BACKGROUND)
+        frame.paste(fitted(scene), (0, 0))
+        frame.paste(sheet.until(index), (0, CARD))
+        frames.append(frame)
+    save(frames, CARDS / f"{film.agent}.webp")
+
+
+def fitted(scene: Record) -> Image.Image:
+    """Return the scene on a square."""
+    picture = Image.fromarray(decode_picture(scene.picture))
+    picture.thumbnail((CARD, CARD), Image.Resampling.LANCZOS)
+    square = Image.new("RGB", (CARD, CARD), BACKGROUND)
+    square.paste(picture, ((CARD - picture.width) // 2, (CARD - picture.height) // 2))
+    return square
+
+
+def save(frames: Sequence[Image.Image], path: Path) -> None:
+    """Write frames as a picture that moves, and begins again after a pause."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    durations = [FRAME] * (len(frames) - 1) + [LAST]
+    frames[0].save(
+        path, save_all=True, append_images=list(frames[1:]), duration=durations, loop=0,
+        quality=82, method=4,
     )  # fmt: skip
-    if run_command_line(list(words)):
-        raise RuntimeError(f"{film.name} could not be filmed")
-    episodes = FILMS / "runs" / "last" / "episodes"
-    recordings = [p for p in episodes.glob("*.npz") if load_clip(p).info.phase == "eval"]
-    recording = max(recordings, key=lambda path: path.stat().st_mtime)
-    for suffix in (".html", ".mp4"):
-        shutil.copy(recording.with_suffix(suffix), FILMS / f"{film.name}{suffix}")
-    frames = MovieFrames(load_clip(recording))
-    picture = Image.fromarray(np.asarray(frames[int(0.6 * len(frames))]))
-    height = round(picture.height * WIDTH / picture.width)
-    PICTURES.mkdir(parents=True, exist_ok=True)
-    picture = picture.resize((WIDTH, height), Image.Resampling.LANCZOS).quantize(128)
-    picture.save(PICTURES / f"{film.name}.png", optimize=True)
 
 
-def main(names: list[str]) -> int:
-    """Make the films whose names contain one of the given parts, or all; return the exit code."""
-    failed = 0
+def _vector(observation: Observation) -> np.ndarray:
+    return observation["observation"] if isinstance(observation, dict) else observation
+
+
+def main(names: Sequence[str]) -> int:
+    """Make the pictures whose names contain one of the given parts, or all."""
+    if not names or "hero" in names:
+        make_hero()
     for film in FILMED:
-        if names and not any(part in film.name for part in names):
-            continue
-        try:
-            make(film)
-        except (RuntimeError, OSError, ValueError) as error:
-            sys.stderr.write(f"{film.name}: {error}\n")
-            failed += 1
-    return int(failed > 0)
+        if not names or any(part in film.agent for part in names):
+            make_card(film)
+    return 0
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +27,8 @@ def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     options = _parse(arguments)
     open_project()
-    with Agent(*_find(options)) as agent:
+    run, cfg, policy = _find(options)
+    with Agent(run, replace(cfg, render_view=options.view or cfg.render_view), policy) as agent:
         summary = agent.evaluate(
             options.episodes,
             seed=options.seed or None,
@@ -93,6 +95,11 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser.add_argument("--record", action="store_true", help="record the first episode")
     parser.add_argument(
         "--metrics", default="", help="shown in the video: q_value,critic_variance,..."
+    )
+    parser.add_argument(
+        "--view",
+        choices=("task", "close"),
+        help="close: a plain background and a nearer camera, for MuJoCo tasks",
     )
     parser.add_argument("--policy", choices=("best", "finished"), default="best")
     parser.add_argument("--stochastic", action="store_true", help="sample actions")

@@ -118,6 +118,10 @@ class RunConfig:
         "display: live viewer; record: video and replay page; human: the task's own window",
         heading="What is shown",
     )
+    render_view: Literal["task", "close"] = _neutral(
+        "task",
+        "close: a plain background and a nearer camera, for MuJoCo tasks; only pictures change",
+    )
     render_freq: int = _neutral(5, "epochs between rendered ones", low=1)
     render_metrics_train: Sequence[str] = _neutral(
         ["train/rollout_rewards_step"], "metrics shown with training episodes"

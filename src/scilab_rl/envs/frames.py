@@ -16,6 +16,9 @@ from scilab_rl.envs.pictures import PictureForm
 DEFAULT_FPS = 25.0
 FRAME_KEY = "scilab_rl.frame"
 STATE_KEY = "scilab_rl.simulator_state"
+CLOSE = "close"
+_NEARER = 0.58  # of the distance of a task's own camera
+_BACKGROUND = (238, 240, 244)
 
 
 class FrameCapture:
@@ -29,10 +32,13 @@ class FrameCapture:
 
     Args:
         env: An environment with ``render_mode="rgb_array"``.
+        view: ``task``: as the task is drawn; ``close``: with a plain background, by a camera that
+            is nearer. It changes pictures only.
     """
 
-    def __init__(self, env: gym.Env) -> None:
+    def __init__(self, env: gym.Env, view: str = "task") -> None:
         self.env = env
+        self._is_close = view == CLOSE
         self._wanted = self._capturing = False
         self._form = PictureForm()
         self._reason = ""  # why the first frame that is missing cannot be drawn
@@ -76,7 +82,7 @@ class FrameCapture:
         try:
             with warnings.catch_warnings():  # Gymnasium's own checks; we report what matters
                 warnings.filterwarnings("ignore", r"(?s).*WARN: ", UserWarning)
-                rendered = self.env.render()
+                rendered = self._render()
         except Exception as error:  # noqa: BLE001 - whatever a renderer raises, learning continues
             self._is_broken = True  # it may be slow in failing, and is not asked again
             self._reason = self._reason or f"{type(error).__name__}: {error}"
@@ -86,6 +92,39 @@ class FrameCapture:
         except ValueError as error:
             self._reason = self._reason or str(error)
             return self._reason
+
+    def _render(self) -> object:
+        if self._is_close:
+            self._is_close = False
+            simplify_scene(self.env)  # before graphics memory gets its textures
+            self.env.render()
+            move_camera(self.env, _NEARER)
+        return self.env.render()
+
+
+def simplify_scene(env: gym.Env) -> None:
+    """Draw a MuJoCo task with a plain background and without the marks of its mocap bodies."""
+    mujoco = sys.modules.get("mujoco")
+    if mujoco is None or not isinstance(
+        model := getattr(env.unwrapped, "model", None), mujoco.MjModel
+    ):
+        return
+    for texture in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX):
+        n_channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+        n_pixels = int(model.tex_height[texture] * model.tex_width[texture])
+        pixels = model.tex_data[start : start + n_pixels * n_channels].reshape(-1, n_channels)
+        pixels[:, :3] = _BACKGROUND
+    is_mocap = model.body_mocapid[model.geom_bodyid] >= 0
+    model.geom_rgba[is_mocap, 3] = 0.0
+    model.geom_matid[is_mocap] = -1
+
+
+def move_camera(env: gym.Env, share: float) -> None:
+    """Move the camera of a MuJoCo task to a share of its distance, once it has drawn a frame."""
+    inner: Any = env.unwrapped
+    renderer = getattr(inner, "mujoco_renderer", None) or getattr(inner, "_renderer", None)
+    if (camera := getattr(getattr(renderer, "viewer", None), "cam", None)) is not None:
+        camera.distance *= share
 
 
 def frame_rate(metadata: Mapping[str, Any]) -> float:

@@ -44,12 +44,15 @@ class RunEnv(gym.Wrapper):
             observation in its place, so that none of it is learned from.
         in_worker: Whether errors are reported in the info, under `FAILURE_KEY`, because they cannot
             be raised across processes.
+        view: How scenes are drawn, ``task`` or ``close``.
     """
 
-    def __init__(self, env: gym.Env, on_nan: str = STOP, *, in_worker: bool = False) -> None:
+    def __init__(
+        self, env: gym.Env, on_nan: str = STOP, *, in_worker: bool = False, view: str = "task"
+    ) -> None:
         super().__init__(env)
         self._contract = StepContract(env)
-        self._frames = FrameCapture(env)
+        self._frames = FrameCapture(env, view)
         self._ends_at_nan, self._in_worker = on_nan == END_EPISODE, in_worker
         self._last_good: object = None
         self._reset_arguments: Info = {}

@@ -109,7 +109,7 @@ def make_single_env(
         raise EnvironmentFailure(
             f"{cfg.env} cannot be made: {type(error).__name__}: {error}"
         ) from error
-    return RunEnv(env, cfg.on_nan, in_worker=in_worker)
+    return RunEnv(env, cfg.on_nan, in_worker=in_worker, view=cfg.render_view)
 
 
 def _registered_env(cfg: RunConfig, render_mode: str | None) -> gym.Env:

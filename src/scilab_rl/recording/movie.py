@@ -47,7 +47,9 @@ _ROWS = 4  # panels in one column, until there are four columns
 _MIN_PANEL_HEIGHT = 112
 NO_VALUE = "-"  # the font has no dash
 _SMOOTH = 2  # everything that does not move is drawn twice as large and scaled down
+WENT_WRONG = ("fell", "lost")  # words of events
 _HELD = 1.5  # seconds; the last frame stays, because players start again at once
+_APART = 60.0  # pixels between the names of events
 _TITLE, _LEFT, _RIGHT, _BOTTOM = 22, 50, 12, 18  # pixels around the curves
 
 
@@ -321,11 +323,13 @@ class PanelSheet:
 
     def _draw_events(self, draw: ImageDraw, panel: _Panel) -> None:
         """Draw a line at each event through all panels; those on top name it."""
+        written = -_APART  # where the last name stands
         for index, event in self.events:
             x, color = self._x(panel, index), event_color(event)
             ends = [_big(x, panel.top), _big(x, panel.bottom)]
             draw.line(ends, fill=_faded(color), width=_SMOOTH)
-            if panel.top == _TITLE:
+            if panel.top == _TITLE and x - written >= _APART:
+                written = x
                 is_late = x > (panel.left + panel.right) / 2
                 where = _big(x - 3 if is_late else x + 3, panel.top + 2)
                 letters, anchor = font(10 * _SMOOTH), "rt" if is_late else "lt"
@@ -385,8 +389,10 @@ class PanelSheet:
 
 
 def event_color(event: str) -> str:
-    """Return the color of an event: green for success, red for what went wrong."""
-    return REACHED if event == "success" else FAILED
+    """Return the color of an event: green for success, red for what went wrong, else gray."""
+    if event == "success":
+        return REACHED
+    return FAILED if any(word in event for word in WENT_WRONG) else FAINT
 
 
 def _faded(color: str) -> str:

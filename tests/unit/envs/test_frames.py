@@ -6,6 +6,7 @@ from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs.frames import FRAME_KEY, frame_rate
 from scilab_rl.envs.run_env import RunEnv
 from scilab_rl.envs.vectorize import make_eval_env, observed_layer
+from scilab_rl.recording.gl import choose_backend
 from scilab_rl.testing import decode_frame
 
 
@@ -219,3 +220,26 @@ def test_an_environment_that_knows_no_render_mode_is_made_all_the_same():
     env.reset()
     assert observed_layer(env).reset_frame == "render() returned None"
     gym.registry.pop("Wordless-v0")
+
+
+def _scenes(view):
+    cfg = RunConfig("FetchPickAndPlace-v4", seed=1, render_view=view)
+    env = make_eval_env(cfg, "rgb_array")
+    env.env_method("capture_frames", True)
+    env.seed(1)
+    env.reset()
+    first = observed_layer(env).reset_frame
+    steps = [env.step(np.full((1, 4), 0.3, np.float32)) for _ in range(3)]
+    env.close()
+    return first, [step[0]["observation"] for step in steps]
+
+
+def test_a_nearer_camera_changes_pictures_only():
+    pytest.importorskip("gymnasium_robotics")
+    choose_backend()
+    (frame, seen), (close, seen_close) = _scenes("task"), _scenes("close")
+    assert np.array_equal(seen, seen_close)
+    assert frame.shape == close.shape
+    corner = np.s_[5:60, 400:470]  # the background; it is green in the task
+    assert np.abs(close[corner].astype(int) - [238, 240, 244]).max() <= 8
+    assert not np.array_equal(frame[corner], close[corner])
