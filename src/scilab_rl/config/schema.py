@@ -139,9 +139,9 @@ class RunConfig:
     )
 
     base_logdir: str = _neutral("data", "folder of all runs", heading="What is kept")
-    restore_policy: str | None = _key(None, "folder of a saved policy to start from")
+    restore_policy: str | None = _key(None, "saved policy, or run, to start from")
     save_model_freq: int = _neutral(
-        0, "environment steps between checkpoints; 0: only when stopped", low=0
+        0, "environment steps between checkpoints, one more at the end; 0: when stopped", low=0
     )
     info: str = _neutral("", "a note to yourself, kept with the run")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 from collections.abc import Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import yaml
@@ -14,7 +15,7 @@ from scilab_rl.config.schema import RunConfig, is_enabled
 from scilab_rl.config.workspace import config_files
 from scilab_rl.errors import ConfigError, RenderingError
 from scilab_rl.run.checks import algorithm_class
-from scilab_rl.run.directory import policy_path
+from scilab_rl.run.directory import CONFIG_FILE, find_named_run, find_policy, policy_path
 from scilab_rl.tracking.background import BackgroundTracker
 from scilab_rl.tracking.base import Tracker, TrackerGroup
 from scilab_rl.tracking.files import FilesTracker
@@ -83,13 +84,17 @@ def make_algorithm(cfg: RunConfig, train_env: VecEnv) -> Algorithm:
 
 
 def restore_policy(cfg: RunConfig, algorithm: Algorithm) -> None:
-    """Start from the saved policy that ``restore_policy`` names, if it names one."""
+    """Start from the saved policy, or the last one of the run, that ``restore_policy`` names."""
     if cfg.restore_policy is None:
         return
     from scilab_rl.training.policy import load_policy
 
-    load_policy(algorithm, policy_path(cfg.restore_policy))
-    _log.info("Policy restored from %s.", cfg.restore_policy)
+    path = policy_path(cfg.restore_policy)
+    if not path.exists() or (path / CONFIG_FILE).is_file():
+        run = find_named_run(cfg.restore_policy, Path(cfg.base_logdir))
+        path = path if run is None else find_policy(run, "finished", "best")
+    load_policy(algorithm, path)
+    _log.info("Policy restored from %s.", path)
 
 
 def open_trackers(cfg: RunConfig) -> TrackerGroup:
