@@ -65,6 +65,7 @@ class GroupEstimates:
         n_failed: Runs that crashed; they are in no estimate.
         steps: The grid of its curve.
         band: Interquartile mean, lower and upper end of its interval on that grid.
+        curves: The evaluations of each run, in the order of scores and seeds.
     """
 
     label: str
@@ -76,6 +77,7 @@ class GroupEstimates:
     n_failed: int
     steps: np.ndarray
     band: tuple[np.ndarray, np.ndarray, np.ndarray]
+    curves: tuple[Curve, ...] = ()
 
     @property
     def n_runs(self) -> int:
@@ -112,7 +114,19 @@ class Contrast:
 
 @dataclass(frozen=True)
 class Comparison:
-    """Everything that the reports show."""
+    """Everything that the reports show.
+
+    Attributes:
+        metric: The metric.
+        settings: How the groups are compared.
+        tasks: The tasks in which all of them have runs.
+        horizon: Steps up to which they are compared, by task.
+        groups: Their estimates.
+        contrasts: Their differences from the first.
+        notes: What a reader must know.
+        runs: One row per run.
+        differences: What differs in their configurations: a key, then its value in each group.
+    """
 
     metric: str
     settings: ComparisonSettings
@@ -122,6 +136,12 @@ class Comparison:
     contrasts: tuple[Contrast, ...]
     notes: tuple[str, ...]
     runs: tuple[Mapping[str, object], ...] = field(repr=False, default=())
+    differences: tuple[tuple[str, ...], ...] = ()
+
+    @property
+    def has_one_length(self) -> bool:
+        """Whether the runs of all tasks are equally long."""
+        return len(set(self.horizon.values())) == 1
 
 
 def compare(groups: Sequence[Group], settings: ComparisonSettings) -> Comparison:
@@ -156,7 +176,7 @@ def compare(groups: Sequence[Group], settings: ComparisonSettings) -> Comparison
     return Comparison(
         metric, settings, tuple(tasks), horizon, estimated,
         _contrasts(estimated, settings), tuple(notes),
-        tuple(_rows(groups, usable, horizon, metric, settings)),
+        tuple(_rows(groups, usable, horizon, metric, settings)), _differences(usable),
     )  # fmt: skip
 
 
@@ -224,7 +244,22 @@ def _estimate(
         n_failed=sum(run.status == FAILED for run in group.runs if run.task in tasks),
         steps=fractions * (max(horizon.values()) if len(set(horizon.values())) == 1 else 1),
         band=curve_band(on_grid),
+        curves=tuple(curve for task in curves for curve in task),
     )
+
+
+def mean_curve(curves: Sequence[Curve], *, as_share: bool) -> tuple[list[float], list[float]]:
+    """Return the mean over runs at their evaluations, from where all of them have been evaluated.
+
+    Args:
+        curves: One per run.
+        as_share: Whether steps are given as a share of the training.
+    """
+    shares = sorted({step / curve.budget for curve in curves for step in curve.steps})
+    first = max(curve.steps[0] / curve.budget for curve in curves)
+    known = np.array([share for share in shares if share >= first])
+    values = np.mean([_at(curve, known * curve.budget + 1e-9) for curve in curves], axis=0)
+    return (known * (1 if as_share else curves[0].budget)).tolist(), values.tolist()
 
 
 def _at(curve: Curve, steps: np.ndarray) -> np.ndarray:
@@ -390,6 +425,16 @@ def _about_sources(groups: Sequence[Group], usable: Sequence[Sequence[RunRecord]
         if keys:
             notes.append(f"{groups[0].label} and {group.label} differ also in {listing(keys)}")
     return notes
+
+
+def _differences(usable: Sequence[Sequence[RunRecord]]) -> tuple[tuple[str, ...], ...]:
+    """Return the keys in which groups differ, each with its values per group."""
+    rows = []
+    for key in sorted(_varying([run for runs in usable for run in runs])):
+        cells = [sorted({run.config.get(key, "-").strip('"') for run in runs}) for runs in usable]
+        if any(cell != cells[0] for cell in cells[1:]):
+            rows.append((key, *(" or ".join(cell) for cell in cells)))
+    return tuple(rows)
 
 
 def _about_crashes(groups: Sequence[GroupEstimates], metric: str) -> list[str]:

@@ -5,23 +5,35 @@ from __future__ import annotations
 import csv
 import dataclasses
 import io
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from scilab_rl.analysis.comparison import SUCCESS, Comparison, Contrast, GroupEstimates
-from scilab_rl.analysis.estimates import Estimate, performance_profile
+from scilab_rl.analysis.comparison import (
+    SUCCESS,
+    Comparison,
+    Contrast,
+    GroupEstimates,
+    mean_curve,
+)
+from scilab_rl.analysis.estimates import N_SAMPLES, Estimate, performance_profile
+from scilab_rl.charts import Interval, Series
+from scilab_rl.drawing import COLORS
 from scilab_rl.errors import MissingDependencyError
 from scilab_rl.files import atomic_write, write_json, write_text
-from scilab_rl.pages import render
+from scilab_rl.pages import Link, render
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-# Okabe and Ito's palette, which is safe for color-blind readers.
-_COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+_SCORES = {
+    "final": "mean of the last three evaluations",
+    "auc": "mean over the training",
+    "steps_to_threshold": "steps to the threshold",
+}
 GROUP_COLUMNS = (
     "group", "runs", "crashed", "IQM", "mean", "median", "area under curve", "reached",
     "steps to threshold",
@@ -95,9 +107,9 @@ def write_reports(comparison: Comparison, folder: Path, *, parquet: bool = False
         MissingDependencyError: If Parquet is requested and pyarrow is not installed.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    image = draw(comparison, folder / "comparison.png")
+    draw(comparison, folder / "comparison.png")
     draw(comparison, folder / "comparison.svg")
-    write_text(folder / "comparison.html", page(comparison, image))
+    write_text(folder / "comparison.html", page(comparison, folder))
     write_text(folder / "comparison.md", markdown(comparison))
     write_json(folder / "comparison.json", as_json(comparison))
     write_table(comparison.runs, folder / "runs.csv")
@@ -175,20 +187,99 @@ def markdown(comparison: Comparison) -> str:
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def page(comparison: Comparison, image: Path) -> str:
-    """Return one HTML file."""
-    run_columns = list(dict.fromkeys(name for run in comparison.runs for name in run))
+def page(comparison: Comparison, folder: Path) -> str:
+    """Return one HTML file, whose links to runs hold in a folder."""
+    is_rate = _is_rate(comparison)
     return render(
         "comparison.html",
-        title=" and ".join(group.label for group in comparison.groups),
+        title=_listed([group.label for group in comparison.groups]),
         conclusions=[conclusion(comparison, contrast) for contrast in comparison.contrasts],
-        about=_about(comparison),
-        groups=_table(GROUP_COLUMNS, group_rows(comparison)),
-        contrasts=_table(CONTRAST_COLUMNS, contrast_rows(comparison)),
-        image=image.read_bytes(),
+        contrasts=[
+            Interval(
+                f"{contrast.label} − {comparison.groups[0].label}",
+                contrast.mean.value, contrast.mean.low, contrast.mean.high,
+                text=f"{contrast.mean}, p = {contrast.p:.2g}: {contrast.verdict}", color=number,
+            )
+            for number, contrast in enumerate(comparison.contrasts, start=1)
+        ],
+        groups=[
+            Interval(
+                group.label, estimate.value, estimate.low, estimate.high,
+                points=np.concatenate(list(group.scores)).tolist(), color=number,
+            )
+            for number, group in enumerate(comparison.groups)
+            for estimate in (group.estimates["iqm"],)
+        ],
+        score=_score_name(comparison),
+        score_range=(0, 1) if is_rate else None,
+        curves=[_series(comparison, group, n) for n, group in enumerate(comparison.groups)],
+        x_label="environment steps" if comparison.has_one_length else "share of the training",
+        metric=comparison.metric,
+        metric_range=(0, 1) if comparison.metric == SUCCESS else None,
+        labels=[group.label for group in comparison.groups],
+        differences=comparison.differences,
         notes=comparison.notes,
-        runs=_table(run_columns, comparison.runs),
+        methods=methods(comparison),
+        tables=(
+            _table(GROUP_COLUMNS, group_rows(comparison)),
+            _table(CONTRAST_COLUMNS, contrast_rows(comparison)),
+        ),
+        runs=_narrow_table(comparison, folder),
+    )  # fmt: skip
+
+
+def methods(comparison: Comparison) -> str:
+    """Return what a paper says about how the groups were compared."""
+    settings = comparison.settings
+    counts = _listed([f"{group.label} ({group.n_runs} runs)" for group in comparison.groups])
+    tasks = ", ".join(f"{task} ({comparison.horizon[task]:,} steps)" for task in comparison.tasks)
+    score = _SCORES[settings.score] + (
+        f" of {settings.threshold:g}" if settings.score == "steps_to_threshold" else ""
     )
+    is_paired = all(contrast.paired for contrast in comparison.contrasts)
+    several = " with Holm's correction" if len(comparison.contrasts) > 1 else ""
+    return (
+        f"We compared {counts} on {tasks}. The score of a run is the {score} of "
+        f"{comparison.metric}. We report interquartile means over runs with 95 % intervals of a "
+        f"stratified bootstrap ({N_SAMPLES:,} samples; Agarwal et al., 2021), and p values of a "
+        f"two-sided permutation test {'paired by seed' if is_paired else 'of unpaired runs'}"
+        f"{several}."
+    )
+
+
+def _listed(words: Sequence[str]) -> str:
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def _series(comparison: Comparison, group: GroupEstimates, number: int) -> Series:
+    as_share = not comparison.has_one_length
+    lines = [
+        ([step / (curve.budget if as_share else 1) for step in curve.steps], list(curve.values))
+        for curve in group.curves
+    ]
+    name = f"{group.label} ({group.n_runs} runs)"
+    return Series(name, lines, mean_curve(group.curves, as_share=as_share), color=number)
+
+
+def _narrow_table(comparison: Comparison, folder: Path) -> tuple[list[str], list[list[object]]]:
+    """Return the runs with their scores; the complete table is in ``runs.csv``."""
+    score = comparison.settings.score
+    several = len(comparison.tasks) > 1
+    rows = []
+    for run in comparison.runs:
+        path = Path(str(run["run"]))
+        address = Path(os.path.relpath(path, folder)).as_posix()
+        cells: list[object] = [run["group"], *([run["env"]] if several else []), run["seed"]]
+        rows.append([*cells, run.get(score), run["status"], Link(path.name, f"{address}/")])
+    return ["group", *(["env"] if several else []), "seed", score, "status", "run"], rows
+
+
+def _is_rate(comparison: Comparison) -> bool:
+    return comparison.metric == SUCCESS and comparison.settings.score != "steps_to_threshold"
+
+
+def _score_name(comparison: Comparison) -> str:
+    return f"{comparison.metric}, {_SCORES[comparison.settings.score]}"
 
 
 def draw(comparison: Comparison, path: Path) -> Path:
@@ -211,11 +302,13 @@ def draw(comparison: Comparison, path: Path) -> Path:
 
 
 def _draw_curves(comparison: Comparison, axes: Axes) -> None:
-    for group, color in _with_colors(comparison):
-        value, low, high = group.band
-        axes.plot(group.steps, value, color=color, label=f"{group.label} ({group.n_runs} runs)")
-        axes.fill_between(group.steps, low, high, color=color, alpha=0.2, linewidth=0)
-    one_length = len(set(comparison.horizon.values())) == 1
+    for number, (group, color) in enumerate(_with_colors(comparison)):
+        series = _series(comparison, group, number)
+        for steps, values in series.lines:
+            axes.plot(steps, np.array(values, float), ".-", color=color, alpha=0.3, lw=0.8, ms=3)
+        assert series.mean is not None
+        axes.plot(*map(np.array, series.mean), color=color, lw=2, label=series.name)
+    one_length = comparison.has_one_length
     axes.set_xlabel("environment steps" if one_length else "share of the training")
     axes.set_ylabel(comparison.metric)
     if comparison.metric == SUCCESS:
@@ -226,7 +319,7 @@ def _draw_curves(comparison: Comparison, axes: Axes) -> None:
 def _draw_profiles(comparison: Comparison, axes: Axes) -> None:
     together = np.concatenate([task for group in comparison.groups for task in group.scores])
     thresholds = np.linspace(together.min(), together.max(), 101)
-    if comparison.metric == SUCCESS and comparison.settings.score != "steps_to_threshold":
+    if _is_rate(comparison):
         thresholds = np.linspace(0, 1, 101)
     for group, color in _with_colors(comparison):
         value, low, high = performance_profile(group.scores, thresholds)
@@ -238,16 +331,12 @@ def _draw_profiles(comparison: Comparison, axes: Axes) -> None:
 
 
 def _with_colors(comparison: Comparison) -> list[tuple[GroupEstimates, str]]:
-    return [(s, _COLORS[i % len(_COLORS)]) for i, s in enumerate(comparison.groups)]
+    return [(s, COLORS[i % len(COLORS)]) for i, s in enumerate(comparison.groups)]
 
 
 def _about(comparison: Comparison) -> str:
     settings = comparison.settings
-    meaning = {
-        "final": "mean of the last three evaluations",
-        "auc": "mean over the training",
-        "steps_to_threshold": "steps to the threshold",
-    }[settings.score]
+    meaning = _SCORES[settings.score]
     tasks = ", ".join(f"{task} ({comparison.horizon[task]:,} steps)" for task in comparison.tasks)
     return (
         f"Score of a run: {meaning} of {comparison.metric}, threshold {settings.threshold:g}. "

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scilab_rl.analysis.comparison import ComparisonSettings, compare, curve_of
+from scilab_rl.analysis.comparison import ComparisonSettings, compare, curve_of, mean_curve
 from scilab_rl.analysis.groups import Group, find_group, read_record, read_records
 from scilab_rl.analysis.report import (
     conclusion,
@@ -19,6 +19,7 @@ from scilab_rl.analysis.report import (
     write_reports,
 )
 from scilab_rl.errors import ConfigError
+from scilab_rl.search.scores import Curve
 from tests.unit.acceptance.runs import make_run
 
 
@@ -223,12 +224,31 @@ def test_reports(tmp_path: Path) -> None:
         "runs.csv",
     }  # fmt: skip
     page = files["comparison.html"].read_text()
-    assert "data:image/png;base64," in page and "http://" not in page.replace("www.w3.org", "")
+    assert "://" not in page
+    assert page.index("td3 is better than sac") < page.index('class="forest"')
+    (run,) = {path for path in tmp_path.glob("*/*-td3-s1-*")}
+    assert f'<a href="../{run.relative_to(tmp_path).as_posix()}/">{run.name}</a>' in page
+    assert "We compared sac (6 runs) and td3 (6 runs) on FetchReach-v4" in page
+    assert "permutation test paired by seed." in page
     assert "td3 is better than sac" in files["comparison.md"].read_text()
     rows = list(csv.DictReader(files["runs.csv"].read_text().splitlines()))
     assert len(rows) == 12 and rows[0]["counted"] == "True"
     assert [row["group"] for row in group_rows(comparison)] == ["sac", "td3"]
     assert contrast_rows(comparison)[0]["pairs"] == "6"
+
+
+def test_the_mean_is_drawn_only_where_every_run_was_measured() -> None:
+    curves = [Curve((100, 200), (0.0, 1.0), 400), Curve((50, 200, 400), (0.5, 0.5, 0.0), 400)]
+    assert mean_curve(curves, as_share=False) == ([100.0, 200.0, 400.0], [0.25, 0.75, 0.5])
+    assert mean_curve(curves, as_share=True)[0] == [0.25, 0.5, 1.0]
+
+
+def test_what_differs_in_the_configurations_is_listed_per_group(tmp_path: Path) -> None:
+    make_two(tmp_path, n=2)
+    comparison = compare(find_groups(tmp_path, "sac", "td3"), ComparisonSettings())
+    differences = {key: values for key, *values in comparison.differences}
+    assert differences["algorithm.name"] == ["sac", "td3"]
+    assert "seed" not in differences
 
 
 def test_a_table_as_parquet_holds_the_same(tmp_path: Path) -> None:
