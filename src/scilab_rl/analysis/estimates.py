@@ -20,6 +20,7 @@ Scores = Sequence[np.ndarray]  # one array of runs per task
 N_SAMPLES = 5000
 _MOST_EXACT = 20_000  # assignments that are still listed completely
 _POWER = 0.8
+_SEPARATION = 1.12
 
 
 @dataclass(frozen=True)
@@ -193,7 +194,9 @@ def detectable_difference(n: int, level: float) -> float | None:
     """Return the difference of two groups of ``n`` runs that a test finds with 80 % power.
 
     The normal approximation with Guenther's correction for few runs (1981, The American
-    Statistician 35), at the largest p value below the level that the exact test can give.
+    Statistician 35), at the largest p value below the level that the exact test can give. Where
+    this is the smallest p value of all, so that only completely separate groups differ, it takes
+    1.12 times as much (from 20,000 simulated experiments with 4 and 5 runs).
 
     Args:
         n: Runs of each group.
@@ -206,11 +209,12 @@ def detectable_difference(n: int, level: float) -> float | None:
     (True, 2.0)
     """
     n_assignments = math.comb(2 * n, n)
-    attained = 2 * math.floor(level * n_assignments / 2 + 1e-9) / n_assignments
-    if not attained:
+    n_extreme = math.floor(level * n_assignments / 2 + 1e-9)
+    if not n_extreme:
         return None
-    quantile = NormalDist().inv_cdf(1 - attained / 2)
-    return (quantile + NormalDist().inv_cdf(_POWER)) * math.sqrt(2 / (n - quantile**2 / 4))
+    quantile = NormalDist().inv_cdf(1 - n_extreme / n_assignments)
+    factor = _SEPARATION if n_extreme == 1 else 1.0
+    return factor * (quantile + NormalDist().inv_cdf(_POWER)) * math.sqrt(2 / (n - quantile**2 / 4))
 
 
 def seeds_needed(

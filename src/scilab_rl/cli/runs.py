@@ -26,6 +26,7 @@ _OPTIONAL = (
     "steps", "started", "time", "epochs", "problem", "reward", "tags", "seed", "note",
 )  # fmt: skip
 _IF_ANY = ("intrinsic", "changed", "note", "tags", "problem")
+_MOST_CHANGED = 3  # keys that a terminal shows
 _PROSE = ("changed", "note", "tags")
 STUDY = "study"
 
@@ -48,6 +49,8 @@ def main(arguments: list[str]) -> int:
         print_json(rows)
     elif rows:
         shown = [{**row, "time": as_clock(row.get("seconds"))} for row in rows]
+        if is_terminal():
+            shown = [row | {"changed": _brief(row["changed"])} for row in shown]
         columns = _COLUMNS if is_terminal() else ("run", *_COLUMNS)
         print_rows(columns, shown, optional=_OPTIONAL, if_any=_IF_ANY, prose=_PROSE)
     else:
@@ -84,6 +87,13 @@ def as_clock(seconds: object) -> str | None:
     '1:02:03'
     """
     return str(dt.timedelta(seconds=int(seconds))) if isinstance(seconds, (int, float)) else None
+
+
+def _brief(changed: object) -> object:
+    """Return the first changed keys, and how many more there are."""
+    if not isinstance(changed, list) or len(changed) <= _MOST_CHANGED:
+        return changed
+    return [*changed[:_MOST_CHANGED], f"+{len(changed) - _MOST_CHANGED}"]
 
 
 def _number(value: object) -> float:

@@ -13,6 +13,8 @@ from rich.text import Text
 
 from scilab_rl.tracking.console import is_interactive
 
+_MINUTES = 90.0  # from so many seconds on, minutes are shown
+
 
 class Progress:
     """Writes lines to standard error and, on a terminal, keeps the newest state below them."""
@@ -61,11 +63,12 @@ def time_left(seconds: float, done: float, left: float) -> str:
         done: What has been done since, in any unit.
         left: What is left, in the same unit.
 
-    >>> time_left(600, 2, 4), time_left(50, 0, 4), time_left(50, 3, 0)
-    ('about 20 min left', 'time left not known yet', 'last runs')
+    >>> time_left(600, 2, 4), time_left(50, 5, 4), time_left(50, 0, 4), time_left(50, 3, 0)
+    ('about 20 min left', 'about 40 s left', 'time left not known yet', 'last runs')
     """
     if left <= 0:
         return "last runs"
     if done <= 0:
         return "time left not known yet"
-    return f"about {seconds / done * left / 60:.0f} min left"
+    rest = seconds / done * left
+    return f"about {rest:.0f} s left" if rest < _MINUTES else f"about {rest / 60:.0f} min left"

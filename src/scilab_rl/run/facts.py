@@ -107,14 +107,15 @@ def all_tags(config: Mapping[str, Any], given_later: Collection[str]) -> list[st
 def changed_keys(run: RunDirectory) -> Iterator[str]:
     """Yield what the user has typed that affects learning, without environment and algorithm.
 
-    The prefix ``algorithm.`` is left out: ``gamma=0.9``.
+    The algorithm's keys come first, without the prefix ``algorithm.``: ``gamma=0.9``.
     """
     try:
         source = json.loads((run / PROVENANCE_FILE).read_text(encoding="utf-8"))
         typed = {str(word).lstrip("+").partition("=")[0]: str(word) for word in source["overrides"]}
     except (OSError, ValueError, TypeError, KeyError):
         return
-    for key, word in learning_part(typed).items():
+    ordered = sorted(learning_part(typed).items(), key=lambda one: "algorithm." not in one[0])
+    for key, word in ordered:
         if key not in _SHOWN:
             yield word.lstrip("+").removeprefix("algorithm.")
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from scilab_rl.acceptance.conditions import Conditions
 from scilab_rl.acceptance.report import Outcome, exit_code, write_reports
-from scilab_rl.acceptance.results import state_file
+from scilab_rl.acceptance.results import TestRun, state_file
 from scilab_rl.acceptance.runner import PerformanceTest, PerformanceTestRunner
 from scilab_rl.parallel.pool import Pool
 from tests.unit.acceptance import toy_worker
@@ -127,3 +128,12 @@ def test_exit_codes(outcomes: list[str], tmp_path: Path) -> None:
     ]
     expected = 1 if "fail" in outcomes else 3 if "inconclusive" in outcomes else 0
     assert exit_code(made) == expected
+
+
+def test_the_time_left_is_between_the_fewest_and_the_most_runs(tmp_path: Path) -> None:
+    """A run took a minute; at least 2 and at most 13 more are needed, two at a time."""
+    pool = SimpleNamespace(size=2)
+    runner = PerformanceTestRunner([make_test(tmp_path)], pool)  # type: ignore[arg-type]
+    assert runner.state() == "0 of 1 tests decided, 0 runs train"
+    runner.results[0].runs[0] = TestRun(0, 1, value=0.97, seconds=60.0)
+    assert runner.state() == "0 of 1 tests decided, 0 runs train, between 1 and 6 min left"

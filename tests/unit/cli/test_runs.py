@@ -198,7 +198,7 @@ def test_notes_and_tags_are_shown_and_filter(make_run, listed):
 
 def test_eighty_columns_are_enough(make_run, tmp_path, monkeypatch, capsys):
     run = make_run("100000-FetchReach-v4-sac-s7-0a1f", result())
-    typed(run, "algorithm.gamma=0.9", "n_epochs=3", "algorithm.learning_rate=0.001")
+    typed(run, "n_epochs=3", "n_envs=2", "algorithm.gamma=0.9", "wrappers=[]", "on_nan=ignore")
     write_annotations(run, "the one with the shaking arm", ["thesis"])
     monkeypatch.setattr("scilab_rl.cli.runs.is_terminal", lambda: True)
     monkeypatch.setattr("scilab_rl.cli.tables.is_terminal", lambda: True)
@@ -208,3 +208,5 @@ def test_eighty_columns_are_enough(make_run, tmp_path, monkeypatch, capsys):
     assert max(map(len, lines)) <= 80
     assert lines[0].split()[:3] == ["id", "env", "algorithm"]
     assert {"changed", "status", "success", "note"} < set(lines[0].split())
+    cell = "".join(line[lines[0].index("changed") : lines[0].index("status")] for line in lines[1:])
+    assert "".join(cell.split()) == "gamma=0.9,n_epochs=3,n_envs=2,+2"
