@@ -166,8 +166,14 @@ class Agent:
             `action_space`, or ``(batch, ...)``.
 
         Raises:
-            ConfigError: If the observation does not have the shape of the space.
+            ConfigError: If the observation does not have the shape of the space, or the policy
+                needs to remember the ones before it.
         """
+        if self.inspector.has_memory:
+            raise ConfigError(
+                f"The policy of {self.cfg.algorithm.name} remembers its episode, so that one "
+                "observation does not tell its action; use evaluate or trajectories."
+            )
         batch, is_single = self._as_batch(observation)
         seen = self.inspector.normalized(batch)
         actions = self._conversions[0].to_env(

@@ -1,4 +1,4 @@
-"""``scilab-rl export RUN``: a table for statistics, a trained agent, or a policy for a robot."""
+"""``scilab-rl export RUN``: a table, a data set, a trained agent, or a policy for a robot."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ def main(arguments: list[str]) -> int:
         return _agent(run, options)
     if options.policy:
         return _policy(run, options)
+    if options.minari is not None:
+        return _minari(run, options)
     cfg = load_recorded(run / CONFIG_FILE)
     rows = _training_episodes(run) if options.training else _trials(run, cfg, options)
     origin = {
@@ -90,6 +92,22 @@ def _policy(run: RunDirectory, options: argparse.Namespace) -> int:
     return 0
 
 
+def _minari(run: RunDirectory, options: argparse.Namespace) -> int:
+    """Write episodes as a data set for offline learning."""
+    from scilab_rl.api.agent import Agent
+    from scilab_rl.api.minari_data import default_id, write_minari
+
+    policy = find_policy(run, options.run, options.saved, "best", "finished")
+    with Agent(run, load_recorded(run / CONFIG_FILE), policy) as agent:
+        dataset_id = options.minari or default_id(agent)
+        folder, summary = write_minari(
+            agent, dataset_id, options.episodes or 100, seed=options.seed or None
+        )
+    _log.info("%s", summary)
+    _log.info("minari.load_dataset('%s') reads it: %s", dataset_id, folder)
+    return 0
+
+
 def _trials(
     run: RunDirectory, cfg: RunConfig, options: argparse.Namespace
 ) -> Sequence[Mapping[str, object]]:
@@ -121,9 +139,9 @@ def _training_episodes(run: RunDirectory) -> Sequence[Mapping[str, object]]:
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = CommandParser(
         "export",
-        "Write the observations, actions and metrics of an agent as a tidy table, keep the agent "
-        "itself under a name, with a card that says how good it is, or write its policy for a "
-        "robot.",
+        "Write the observations, actions and metrics of an agent as a tidy table, its episodes as "
+        "a data set for offline learning, keep the agent itself under a name, with a card that "
+        "says how good it is, or write its policy for a robot.",
         run=True,
         base=True,
     )
@@ -133,6 +151,13 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         "--trials", action="store_true", help="new episodes of its policy (the default)"
     )
     what.add_argument("--training", action="store_true", help="the recorded training episodes")
+    what.add_argument(
+        "--minari",
+        nargs="?",
+        const="",
+        metavar="ID",
+        help="new episodes of its policy as a Minari data set; default: ENVIRONMENT/ALGORITHM-v0",
+    )
     what.add_argument(
         "--policy",
         type=Path,
@@ -145,7 +170,11 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         help="keep the policy as agent:NAME, and measure it: agents/NAME/README.md",
     )
     add("--per", choices=("step", "episode"), default="step", help="what a row is; default: a step")
-    add("--episodes", type=positive, help="default: 20; of an agent: 1000, over 5 seeds")
+    add(
+        "--episodes",
+        type=positive,
+        help="default: 20; for Minari: 100; of an agent: 1000, over 5 seeds",
+    )
     add("--saved", choices=SAVED, default="finished", help="which policy; default: finished")
     add(
         "--softmax",

@@ -194,6 +194,11 @@ class AgentInspector:
             return float(reward)
         return float(self._normalization.normalize_reward(np.array([reward]))[0])
 
+    @property
+    def has_memory(self) -> bool:
+        """Whether what the policy does depends on earlier observations."""
+        return self._memory is not None
+
     def after(self, observation: Observation) -> AgentInspector:
         """Return the inspector of the next step, which remembers an observation if policies do.
 

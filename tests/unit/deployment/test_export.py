@@ -37,6 +37,7 @@ CHOICE, GOALS_CHOICE = (
 )  # fmt: skip
 CASES = [
     *((name, GOALS) for name in ("cleansac", "cleansacmc", "actor_critic", "jaxsac", "jaxtd3")),
+    ("jaxcrl", GOALS),
     *((name, GOALS) for name in ("sac", "td3", "ddpg", "tqc", "ppo", "cleanppo")),
     *((name, BOX) for name in ("cleansac", "jaxsac", "sac", "td3", "ppo", "cleanppo", "a2c")),
     *((name, CHOICE) for name in ("cleandqn", "dqn", "qrdqn", "ppo", "cleanppo", "onestepac")),
@@ -173,6 +174,7 @@ def test_a_relays_flag_is_off_and_a_part_of_the_range_is_used(tmp_path) -> None:
              " n_stack: 2}]"],
             "the vector wrapper VecFrameStack",
         ),
+        ("recurrentppo", [f"env={BOX}"], "it is recurrent"),
     ],
 )  # fmt: skip
 def test_what_cannot_be_described_is_refused_in_one_line(algorithm, overrides, reason) -> None:
