@@ -53,6 +53,7 @@ BENCHMARKS = {
     "decisions": Benchmark(("decisions.py",), "what a study does next, with 10,000 runs", 3),
     "board": Benchmark(("board.py",), "the board of 1,000 runs: size, time to open", 1),
     "metrics": Benchmark(("load.py", "metrics"), "values recorded per second", 1),
+    "exported": Benchmark(("exported_policies.py",), "policies for robots: exactness, time", 3),
     "reach": Benchmark(("time_to_success.py", "reach"), "time until FetchReach is mastered", 40),
     "push": Benchmark(("time_to_success.py", "push"), "time until FetchPush is mastered", 50),
     "pick": Benchmark(("time_to_success.py", "pick"), "FetchPickAndPlace in a fixed budget", 300),

@@ -13,6 +13,7 @@ from scilab_rl.acceptance.agents import PAGE_FILE, card_page, measure, read_card
 from scilab_rl.analysis.estimates import success_interval
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.workspace import SHIPPED_AGENTS
+from scilab_rl.deployment.export import write_policy
 from scilab_rl.learning.inspector import AgentInspector
 from scilab_rl.run.directory import CONFIG_FILE, all_agents, find_policy, find_run
 from scilab_rl.run.player import load_player
@@ -73,6 +74,13 @@ def test_its_card_is_complete_and_holds_nothing_of_a_machine(agent) -> None:
     for path in agent.path.rglob("*"):
         if path.suffix in (".json", ".jsonl", ".yaml", ".md"):
             assert not re.search(r"[\"' ]/\w", path.read_text(encoding="utf-8")), path
+
+
+@pytest.mark.slow
+def test_its_exported_policy_acts_the_same(agent, tmp_path) -> None:
+    report = write_policy(agent, find_policy(agent, "finished"), tmp_path / "policy")
+    assert report["observations"] == 10_000 and report["numpy"] <= 1e-5
+    assert report["onnx"] is None or report["onnx"] <= 1e-5
 
 
 @pytest.mark.slow

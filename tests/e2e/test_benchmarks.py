@@ -67,6 +67,9 @@ SMALLEST = {
     "study": (["smaller_study.py"], "unequal"),
     "decisions": (["decisions.py", "--runs", "30"], "sqlite, 30 runs"),
     "metrics": (["load.py", "metrics", "--scale", "0.01"], "part"),
+    "exported": (
+        ["exported_policies.py", "--agents", "CartPole", "--observations", "100"], "agents",
+    ),
     "reach": (
         [
             "time_to_success.py", "reach", "n_epochs=1", "eval_after_n_steps=60",
