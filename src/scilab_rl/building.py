@@ -17,7 +17,7 @@ from stable_baselines3.common.vec_env import VecEnv
 from scilab_rl.algorithms.intrinsic.build import attach_intrinsic_reward, with_intrinsic_reward
 from scilab_rl.errors import ConfigError
 from scilab_rl.learning.algorithm import Algorithm
-from scilab_rl.learning.arguments import INTRINSIC, accepts
+from scilab_rl.learning.arguments import DEMOS, INTRINSIC, accepts
 from scilab_rl.learning.compatibility import is_goal_space, is_large_image, longest_episode
 from scilab_rl.learning.replay import HindsightReplayBuffer, can_hold
 
@@ -58,6 +58,8 @@ def build_algorithm(
         arguments["action_noise"] = _shaped_noise(noise, env)
     given = {"env": env, "seed": seed, "device": device}
     arguments |= {name: value for name, value in given.items() if accepts(cls, name)}
+    if not accepts(cls, DEMOS):
+        arguments.pop(DEMOS, None)  # the run puts them into the replay buffer
     intrinsic: Any = None if accepts(cls, INTRINSIC) else arguments.pop(INTRINSIC, None)
     if intrinsic is not None:
         arguments["replay_buffer_class"] = _intrinsic_reward_buffer(arguments, env)

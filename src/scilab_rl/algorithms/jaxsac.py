@@ -25,6 +25,7 @@ Algorithms and Applications", arXiv 1812.05905. What differs:
                       al., 2021, REDQ, arXiv 2101.05982, algorithm 1), with several
                       ``gradient_steps`` per environment step.
     relay             a goal before the task's (Luo et al., 2022, arXiv 2208.00843), see `relay`.
+    bc_weight         imitation of demonstrated actions (Nair et al., 2018, arXiv 1709.10089).
     policy_delay      critic updates per actor update (Fujimoto et al., 2018, arXiv 1802.09477).
     precision         bfloat16 halves the work of matrix products on processors that know it;
                       weights, losses and targets stay float32.
@@ -49,6 +50,7 @@ from torch import Tensor
 from scilab_rl.algorithms.cleansac import parse_ent_coef
 from scilab_rl.algorithms.intrinsic.build import make_intrinsic_reward
 from scilab_rl.envs.types import Observation
+from scilab_rl.errors import ConfigError
 from scilab_rl.learning.base import LazyNumber
 from scilab_rl.learning.jax_engine import Array, Batch, Params, State, forward
 from scilab_rl.learning.jax_off_policy import (
@@ -76,6 +78,8 @@ class Settings(UpdateSettings):
     target_entropy: float
     backup_entropy: bool
     scale: float
+    bc_weight: float = 0.0
+    q_filter: bool = True
 
 
 class JAXSAC(JaxOffPolicyAlgorithm):
@@ -87,6 +91,9 @@ class JAXSAC(JaxOffPolicyAlgorithm):
         target_entropy: Entropy that a learned alpha aims at; ``auto``: -n_actions.
         backup_entropy: Whether the target rewards entropy.
         action_scale_factor: Fraction of the action range that is used.
+        bc_weight: Weight of the imitation of demonstrated actions in the actor's loss; needs
+            ``demos``. 0: none.
+        q_filter: Whether only those are imitated that the critics find better than the actor's.
         intrinsic: A reward that the agent gives itself, mixed into the environment's; see
             `scilab_rl.algorithms.intrinsic`. None: none.
         **common: Learning rate, critics, exploration and so on, see `JaxOffPolicyAlgorithm`.
@@ -97,6 +104,7 @@ class JAXSAC(JaxOffPolicyAlgorithm):
         "train/ent_coef",
         "train/rollout_logpi_step",
         ("train/ent_coef_loss", "ent_coef is auto", lambda self: self.learns_ent_coef),
+        ("train/bc_loss", "bc_weight is above 0", lambda self: self.bc_weight > 0),
     )
 
     def __init__(
@@ -106,11 +114,14 @@ class JAXSAC(JaxOffPolicyAlgorithm):
         target_entropy: str | float = "auto",
         backup_entropy: bool = True,
         action_scale_factor: float = 1.0,
+        bc_weight: float = 0.0,
+        q_filter: bool = True,
         intrinsic: str | Mapping[str, object] | None = None,
         **common: Any,
     ) -> None:
         super().__init__(**common)
         self.action_scale_factor = action_scale_factor
+        self.bc_weight = bc_weight
         self.learns_ent_coef, ent_coef = parse_ent_coef(ent_coef)
         settings = Settings.of(
             self,
@@ -118,15 +129,29 @@ class JAXSAC(JaxOffPolicyAlgorithm):
             target_entropy=float(-self.n_actions if target_entropy == "auto" else target_entropy),
             backup_entropy=backup_entropy,
             scale=action_scale_factor,
+            bc_weight=bc_weight,
+            q_filter=q_filter,
         )
         networks = self.draw_networks(2 * self.n_actions)
         state = initial_state(*networks, ent_coef, self.learning_rate)
+        if bc_weight:
+            state["actor_losses"]["bc_loss"] = np.float32(0)
         self.start_learning(update, settings, state)
         self.intrinsic = make_intrinsic_reward(intrinsic, self)
 
     def draw_random_actions(self) -> Tensor:
         """Draw an action for each environment from the range that is used."""
         return self.action_scale_factor * super().draw_random_actions()
+
+    def more_fields(self, n: int) -> dict[str, np.ndarray]:
+        """Return which of n transitions are demonstrations, if they are imitated."""
+        if not self.bc_weight:
+            return {}
+        if getattr(self.replay_buffer, "demos", None) is None:
+            raise ConfigError(
+                "algorithm.bc_weight needs demonstrations: algorithm.demos=scripted:N."
+            )
+        return {"is_demo": self.replay_buffer.from_demos(n).astype(np.float32)}  # type: ignore[union-attr]
 
     def act(self, observations: Tensor, deterministic: bool) -> Tensor:
         """Choose actions in [-1, 1], with the networks of the last finished round."""
@@ -185,8 +210,13 @@ def update(
         (loss, log_prob), gradient = jax.value_and_grad(actor_loss, has_aux=True)(
             state["actor"], settings, state, batch, actor_key
         )
-        state = adam_step(state, "actor", gradient, settings.learning_rate)
         actor_losses = state["actor_losses"] | {"actor_loss": loss}
+        if settings.bc_weight:
+            actor_losses["bc_loss"], imitation = jax.value_and_grad(cloning_loss)(
+                state["actor"], settings, state, batch
+            )
+            gradient = jax.tree.map(lambda g, i: g + settings.bc_weight * i, gradient, imitation)
+        state = adam_step(state, "actor", gradient, settings.learning_rate)
         if settings.learns_ent_coef:
             actor_losses["ent_coef_loss"], gradient = jax.value_and_grad(temperature_loss)(
                 state["log_ent_coef"], log_prob, settings.target_entropy
@@ -235,6 +265,27 @@ def actor_loss(
     # The minimum over two critics (eq. 9); the mean over a large ensemble (REDQ, algorithm 1).
     value = q.min(axis=0) if settings.n_target_critics == len(q) else q.mean(axis=0)
     return (jnp.exp(state["log_ent_coef"]) * log_prob - value).mean(), log_prob
+
+
+def cloning_loss(actor: Params, settings: Settings, state: State, batch: Batch) -> Array:
+    """Return the squared distance from demonstrated actions, the mean over the demonstrations.
+
+    With the Q-filter, an action counts only where Q(s, a) > Q(s, pi(s)) (Nair et al., 2018, arXiv
+    1709.10089, eq. 5). pi(s) is the most likely action, Q the minimum over the critics.
+    """
+    mean, _ = gaussian(forward(actor, batch.observations, precision=settings.precision), jnp)
+    actions = settings.scale * jnp.tanh(mean)
+    assert batch.is_demo is not None
+    counts = batch.is_demo
+    if settings.q_filter:
+        own = jax.lax.stop_gradient(actions)
+        demonstrated, chosen = (
+            q_values(state["critic"], batch.observations, a, settings.precision).min(axis=0)
+            for a in (batch.actions, own)
+        )
+        counts = counts * (demonstrated > chosen)
+    errors = jnp.square(actions - batch.actions).sum(axis=-1)
+    return (counts * errors).sum() / jnp.maximum(batch.is_demo.sum(), 1.0)
 
 
 def temperature_loss(log_ent_coef: Array, log_prob: Array, target_entropy: float) -> Array:

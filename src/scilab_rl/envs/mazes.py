@@ -63,6 +63,9 @@ class Maze(MujocoGoalEnv):
         n_substeps: Simulation steps per environment step.
         kwargs: Those of `GoalEnv`: reward_type (sparse: 1 at the goal | sparseneg: -1 elsewhere |
             dense: exp(-distance)), threshold, ...
+
+    Attributes:
+        rows: The map.
     """
 
     rewards = MappingProxyType(
@@ -86,6 +89,7 @@ class Maze(MujocoGoalEnv):
         if reset_target and not continuing:
             raise ConfigError("env_kwargs.reset_target=true needs env_kwargs.continuing=true.")
         rows = map_rows(maze_map)
+        self.rows = rows
         self.n_objects = n_objects
         self.reset_target = bool(reset_target)
         self.cell_size = cell_size

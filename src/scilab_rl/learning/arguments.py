@@ -15,6 +15,8 @@ _HIDDEN = ("self", "_init_setup_model", "env", "seed", "device", "verbose", "ten
 
 # Off-policy algorithms of Stable-Baselines3 take it too, see `intrinsic.build`.
 INTRINSIC = "intrinsic"
+# Off-policy algorithms take demonstrations through their replay buffer, see `run.demonstrations`.
+DEMOS = "demos"
 
 _FRACTION = (0.0, 1.0)
 _POSITIVE = (math.ulp(0.0), math.inf)
@@ -41,6 +43,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "policy_delay": _AT_LEAST_1,
     "target_update_interval": _AT_LEAST_1,
     "learning_starts": _AT_LEAST_0,
+    "bc_weight": _AT_LEAST_0,
     "max_grad_norm": _POSITIVE,
     "clip_range": _POSITIVE,
 }
@@ -51,7 +54,14 @@ def allowed_arguments(cls: Callable[..., object]) -> list[str]:
     names = [name for name in constructor_parameters(cls) if name not in _HIDDEN]
     if takes_intrinsic_reward(cls) and INTRINSIC not in names:
         names.append(INTRINSIC)
+    if takes_demos(cls) and DEMOS not in names:
+        names.append(DEMOS)
     return names
+
+
+def takes_demos(cls: Callable[..., object]) -> bool:
+    """Return whether ``algorithm.demos`` works: where there is a replay buffer."""
+    return inspect.isclass(cls) and "replay_buffer_class" in constructor_parameters(cls)
 
 
 def takes_intrinsic_reward(cls: Callable[..., object]) -> bool:

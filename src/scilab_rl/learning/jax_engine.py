@@ -37,7 +37,8 @@ class Batch(NamedTuple):
     Shapes:
         observations, next_observations: ``(batch, n_observations)``; actions:
         ``(batch, n_actions)``; rewards, dones: ``(batch,)``; return_bounds: ``(2,)``, the lowest
-        and the highest return that there can be.
+        and the highest return that there can be; is_demo: ``(batch,)``, 1 where it is from a
+        demonstration, None where nobody asks.
     """
 
     observations: Array
@@ -46,6 +47,7 @@ class Batch(NamedTuple):
     next_observations: Array
     dones: Array
     return_bounds: Array
+    is_demo: Array | None = None
 
 
 def dense_layers(sizes: Sequence[int], *, n: int | None = None, layer_norm: bool = False) -> Params:

@@ -248,7 +248,12 @@ class JaxOffPolicyAlgorithm(OffPolicyAlgorithm):
             next_observations=self.normalizer(batch.next_observations.numpy()),
             dones=batch.dones.numpy().ravel(),
             return_bounds=np.tile(bounds, n_updates),
+            **self.more_fields(len(rewards)),
         )
+
+    def more_fields(self, n: int) -> dict[str, np.ndarray]:
+        """Return more of n transitions that were drawn, for the update; nothing by default."""
+        return {}
 
     def finish_round(self) -> None:
         """Wait for the round under way, and record how it went."""

@@ -15,6 +15,8 @@ take the place of Stable-Baselines3's ``HerReplayBuffer``, from which it differs
 * Goals may be drawn from the discounted future (``geometric``), and without rewards
   (``goals_only``), as contrastive algorithms need them; see `jaxcrl`.
 * With a `relay`, half of each batch is of a goal that comes before the task's.
+* A share of each batch may come from demonstrations, a ring of their own that nothing overwrites;
+  they are relabeled like all others (Nair et al., 2018, arXiv 1709.10089, section IV).
 * Episodes in which the achieved goal moved may be preferred (``moved_share``): where an object lies
   still, every goal of the episode is the same, and there is nothing to learn about pushing it. That
   is the coarsest form of Zhao and Tresp, 2018, "Energy-Based Hindsight Experience Prioritization",
@@ -116,6 +118,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
 
     Attributes:
         rows: Observations as vectors. Shapes: ``(n_rows, n_envs, n_observations)``.
+        demos: Demonstrations, see `use_demos`; None: none.
+        demo_share: Their share of each batch.
     """
 
     def __init__(
@@ -161,6 +165,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
         self.relay = relay
         self.info_keys = tuple(info_keys)
         self.her_ratio = 1.0 if goals_only else 1 - 1 / (n_sampled_goal + 1)
+        self.demos: HindsightReplayBuffer | None = None
+        self.demo_share = 0.0
         self.random = np.random.default_rng(
             np.random.randint(2**31, size=4) if seed is None else seed
         )
@@ -195,8 +201,39 @@ class HindsightReplayBuffer(HerReplayBuffer):
         super().set_env(env)
         self._judge_by(env)
 
+    def use_demos(self, n_rows: int, share: float, seed: int) -> HindsightReplayBuffer:
+        """Make a ring for demonstrations, which is drawn from in each batch, and return it.
+
+        Args:
+            n_rows: As many as their steps and episodes together.
+            share: Of each batch.
+            seed: Of the ring's generator.
+        """
+        self.demo_share = share
+        self.demos = HindsightReplayBuffer(
+            n_rows + _MIN_ROWS, self.observation_space, self.action_space, self.env,  # type: ignore[arg-type]
+            self.device, n_sampled_goal=self.n_sampled_goal,
+            goal_selection_strategy=self.strategy, moved_share=self.moved_share,
+            desired_share=self.desired_share, discount=self.discount,
+            goals_only=self.goals_only, relay=self.relay, info_keys=self.info_keys,
+            seed=seed,
+        )  # fmt: skip
+        return self.demos
+
+    def from_demos(self, n: int) -> np.ndarray:
+        """Return which of n transitions that are drawn together are demonstrations.
+
+        They are spread evenly, so that each of several batches has its share; and two by two, since
+        of each two one may have the relay's goal.
+
+        Shapes:
+            result: ``(n,)``, of truth values.
+        """
+        pairs = np.arange(n) // 2
+        return np.floor((pairs + 1) * self.demo_share) > np.floor(pairs * self.demo_share)
+
     def reset(self) -> None:
-        """Forget everything."""
+        """Forget everything but the demonstrations."""
         super().reset()
         self._cursors[:] = 0
         self._moved = self._moved[:, :0]
@@ -294,6 +331,15 @@ class HindsightReplayBuffer(HerReplayBuffer):
         Raises:
             RuntimeError: If no episode has ended yet.
         """
+        if self.demos is None:
+            return self._draw(batch_size, env)
+        chosen = self.from_demos(batch_size)
+        own = self._draw(batch_size - int(chosen.sum()), env)
+        shown = self.demos._draw(int(chosen.sum()), env)
+        return Transitions(*(_merge(chosen, *pair) for pair in zip(shown, own, strict=True)))
+
+    def _draw(self, batch_size: int, env: VecNormalize | None) -> Transitions:
+        """Draw from this ring alone."""
         cells = self._draw_cells(batch_size)
         batch = Transitions(
             observations=self._rows_at(cells),
@@ -497,6 +543,13 @@ class HindsightReplayBuffer(HerReplayBuffer):
     def _normalized(self, vectors: np.ndarray, env: VecNormalize) -> np.ndarray:
         normalized: Any = env.normalize_obs(self._to_entries(vectors))
         return self._to_vectors(normalized, len(vectors))
+
+
+def _merge(chosen: np.ndarray, some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Return ``some`` at the chosen places, in their order, and ``others`` at the rest."""
+    merged = np.empty((len(chosen), *others.shape[1:]), others.dtype)
+    merged[chosen], merged[~chosen] = some, others
+    return merged
 
 
 def _check_shares(**shares: float) -> None:

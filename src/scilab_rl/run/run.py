@@ -26,6 +26,7 @@ from scilab_rl.redaction import RedactingFormatter, redact
 from scilab_rl.results import RunResult
 from scilab_rl.run import provenance
 from scilab_rl.run.checks import check_metrics, complete, prepare_torch
+from scilab_rl.run.demonstrations import collect_demos, prepare_demos
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory
 from scilab_rl.run.parts import (
     make_algorithm,
@@ -69,6 +70,7 @@ def start_run(
     with directory.in_use(), _log_file(directory / "train.log"):
         try:
             session = build_session(cfg, directory, callbacks)
+            collect_demos(cfg, session.algorithm)
             provenance.write(directory, overrides, session.eval_env.envs[0])  # type: ignore[attr-defined]
             session.begin()
         except ConfigError:
@@ -289,6 +291,7 @@ def build_session(
     train_env, eval_env = make_environments(cfg)
     algorithm = make_algorithm(cfg, train_env)
     check_metrics(cfg, algorithm)
+    prepare_demos(cfg, algorithm)
     restore_policy(cfg, algorithm)
     trackers = open_trackers(cfg)
     trainer = Trainer(cfg, algorithm, eval_env, trackers, directory.path)

@@ -63,6 +63,7 @@ _CANDIDATES = (
 )
 # Plumbing of Stable-Baselines3 and ours, which a YAML file may leave at its defaults.
 _PLUMBING = {
+    "demos",
     "intrinsic",
     "optimize_memory_usage",
     "rollout_buffer_class",

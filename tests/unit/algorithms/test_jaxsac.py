@@ -15,6 +15,7 @@ import jax.numpy as jnp  # noqa: E402
 
 from scilab_rl.algorithms import cleansac, jaxsac  # noqa: E402
 from scilab_rl.algorithms.jaxsac import JAXSAC, Settings  # noqa: E402
+from scilab_rl.errors import ConfigError  # noqa: E402
 from scilab_rl.learning.jax_engine import Batch, dense_layers  # noqa: E402
 from scilab_rl.learning.replay import HindsightReplayBuffer  # noqa: E402
 from scilab_rl.metrics.logger import MetricLogger  # noqa: E402
@@ -244,3 +245,51 @@ def test_ent_coef_of_zero_is_allowed(make: Any) -> None:
     model.set_logger(MetricLogger())
     model.learn(60)
     assert np.isfinite(float(model.logger.name_to_value["train/actor_loss"]))
+
+
+def imitation(q_filter: bool, is_demo: list[float], preference: float) -> float:
+    """Return the loss of an actor that always answers tanh(0) = 0 for demonstrated 0.5 and 1.
+
+    The critics' only weight is that of the first action: its sign says which action is better.
+    """
+    actor = [{"weight": np.zeros((1, 2), np.float32), "bias": np.zeros(2, np.float32)}]
+    critic = [{"weight": np.array([[[0.0], [preference]]], np.float32),
+               "bias": np.zeros((1, 1, 1), np.float32)}]  # fmt: skip
+    zeros = np.zeros(2, np.float32)
+    batch = Batch(
+        observations=np.zeros((2, 1), np.float32), actions=np.array([[0.5], [1.0]], np.float32),
+        rewards=zeros, next_observations=np.zeros((2, 1), np.float32), dones=zeros,
+        return_bounds=zeros, is_demo=np.array(is_demo, np.float32),
+    )  # fmt: skip
+    chosen = settings(bc_weight=1.0, q_filter=q_filter)
+    return float(jaxsac.cloning_loss(actor, chosen, {"critic": critic}, batch))
+
+
+@pytest.mark.parametrize(
+    ("q_filter", "is_demo", "preference", "expected"),
+    [
+        (False, [1.0, 1.0], -1.0, 0.625),  # (0.25 + 1) / 2
+        (False, [1.0, 0.0], -1.0, 0.25),  # the mean over demonstrations, here one
+        (False, [0.0, 0.0], -1.0, 0.0),
+        (True, [1.0, 1.0], 1.0, 0.625),  # the critics find 0.5 and 1 better than 0
+        (True, [1.0, 1.0], -1.0, 0.0),  # or worse
+    ],
+)
+def test_imitation_by_hand(q_filter, is_demo, preference, expected) -> None:
+    assert imitation(q_filter, is_demo, preference) == pytest.approx(expected)
+
+
+def test_imitation_moves_the_actor_and_needs_demonstrations(make: Any) -> None:
+    state, batch = a_state(), a_batch()._replace(is_demo=np.ones(BATCH, np.float32))
+    state["actor_losses"]["bc_loss"] = jnp.float32(0)
+    plain, _ = jaxsac.update(settings(), state, batch, KEY, 0)
+    cloning = settings(bc_weight=100.0, q_filter=False)
+    moved, losses = jaxsac.update(cloning, state, batch, KEY, 0)
+    assert float(losses["bc_loss"]) > 0
+    before = jaxsac.cloning_loss(state["actor"], cloning, state, batch)
+    after = jaxsac.cloning_loss(moved["actor"], cloning, moved, batch)
+    assert after < before
+    assert not np.array_equal(plain["actor"][0]["weight"], moved["actor"][0]["weight"])
+    model = make(bc_weight=1.0)
+    with pytest.raises(ConfigError, match="needs demonstrations"):
+        model.more_fields(4)

@@ -608,3 +608,53 @@ def test_goals_alone_need_no_reward() -> None:
 def test_geometric_goals_need_a_discount(discount: float) -> None:
     with pytest.raises(ConfigError, match="above 0 and below 1"):
         make(goal_selection_strategy="geometric", discount=discount)
+
+
+def with_demos(share: float = 0.5, **kwargs: Any) -> Any:
+    """Episodes 0 and 1 are the agent's own, 50 and 51 are demonstrations."""
+    buffer = make(**kwargs)
+    record(buffer, [3, 4])
+    record(buffer.use_demos(9, share, seed=3), [3, 4], first=50)
+    return buffer
+
+
+@pytest.mark.parametrize(
+    ("share", "places"),
+    [(0.5, [2, 3, 6, 7, 10, 11]), (0.25, [6, 7]), (0.75, [2, 3, 4, 5, 6, 7, 10, 11])],
+)
+def test_demonstrations_have_their_places_in_a_batch(share: float, places: list[int]) -> None:
+    buffer = with_demos(share)
+    assert buffer.from_demos(12).nonzero()[0].tolist() == places
+    seen = drawn(buffer, 12)
+    assert (seen["episode"] >= 50).nonzero()[0].tolist() == places
+
+
+def test_each_of_several_batches_has_its_share() -> None:
+    seen = drawn(with_demos(), 16 * 256)
+    assert ((seen["episode"] >= 50).reshape(16, 256).sum(axis=1) == 128).all()
+    assert set(seen["episode"]) == {0.0, 1.0, 50.0, 51.0}
+
+
+def test_demonstrations_are_relabeled_as_all_others() -> None:
+    seen = drawn(with_demos())
+    shown = seen["episode"] >= 50
+    for part in (shown, ~shown):
+        assert seen["relabeled"][part].mean() == pytest.approx(0.8, abs=0.03)
+        chosen = part & seen["relabeled"]
+        # A later place of the same episode: 100 * episode + step.
+        np.testing.assert_array_equal(seen["desired"][chosen] // 100, seen["episode"][chosen])
+        assert (seen["desired"][chosen] > seen["achieved"][chosen]).all()
+        reached = seen["next_achieved"] == seen["desired"]
+        assert (seen["reward"][chosen] == np.where(reached[chosen], 0.0, -1.0)).all()
+
+
+def test_demonstrations_outlive_the_ring_and_a_checkpoint(tmp_path: Path) -> None:
+    buffer = with_demos(size=12)
+    record(buffer, [4] * 20, first=2)
+    assert {50.0, 51.0} <= set(drawn(buffer)["episode"])
+    checkpoint.save(capture({"buffer": buffer}), tmp_path / "c", step=1)
+    other = make(size=12, seed=99)
+    other.use_demos(9, 0.5, seed=98)
+    restore({"buffer": other}, checkpoint.load(tmp_path / "c"))
+    for one, again in zip(buffer.sample_arrays(64), other.sample_arrays(64), strict=True):
+        np.testing.assert_array_equal(one, again)
