@@ -24,6 +24,8 @@ from scilab_rl import files
 from scilab_rl.config.schema import learning_config
 from scilab_rl.errors import ConfigError
 from scilab_rl.pages import render
+from scilab_rl.recording.records import FOLDER as EPISODES
+from scilab_rl.run.annotations import ANNOTATIONS_FILE
 from scilab_rl.run.curves import CURVE_FILE
 from scilab_rl.run.directory import CONFIG_FILE, RESULT_FILE, RunDirectory, all_runs, read_epochs
 from scilab_rl.run.facts import read_run
@@ -34,6 +36,8 @@ _MOST_POINTS, _FEWEST_POINTS = 200, 20  # of a curve
 _MOST_VALUES = 3_500_000  # of all curves together: 10 MB
 _MISSING = 2**16 - 1
 _N_PAGES = 6  # of one run that are linked, the newest ones
+_PAGE_FOLDERS = ("goals", "whatif")  # of pages that commands make of a run
+_OVERVIEWS = ("episodes", "highlights")
 # What the page shows of `read_run`.
 _FACTS = (
     "run", "id", "started", "seed", "status", "success", "reward", "epochs", "steps", "seconds",
@@ -130,9 +134,9 @@ def render_board(content: Mapping[str, object], *, watches: bool) -> str:
 
 def _state(run: RunDirectory) -> object:
     """Return what changes whenever anything that the board shows of a run changes."""
-    names = (CONFIG_FILE, RESULT_FILE, "metrics.jsonl", "annotations.json", "episodes")
+    files_shown = (CONFIG_FILE, RESULT_FILE, "metrics.jsonl", ANNOTATIONS_FILE)
     found = []
-    for name in names:
+    for name in (*files_shown, EPISODES, *_PAGE_FOLDERS):
         try:
             status = (run / name).stat()
             found.append((name, status.st_mtime_ns, status.st_size))
@@ -154,17 +158,17 @@ def _read(run: RunDirectory, studies: Sequence[str], base: Path) -> BoardRun:
 
 
 def _links(run: RunDirectory, base: Path) -> Iterable[tuple[str, str]]:
-    """Yield what a browser can show of a run: its pages, the newest first, and its folder."""
+    """Yield what a browser can show of a run: pages, the newest replays, curve and files."""
     address = run.path.relative_to(base).as_posix()
-    own = sorted(path.name for path in run.path.glob("*.html"))
-    found = sorted(run.path.glob("episodes/*.html"), reverse=True)
-    overviews = [path for path in found if path.stem in ("episodes", "highlights")]
-    episodes = [path for path in found if path not in overviews][: _N_PAGES - len(overviews)]
-    for name in own:
-        yield name.removesuffix(".html"), f"{address}/{name}"
-    for path in (*overviews, *episodes):
-        name = path.stem if path in overviews else f"replay {path.stem}"
-        yield name, f"{address}/episodes/{path.name}"
+    pages = [page for folder in _PAGE_FOLDERS for page in sorted(run.path.glob(f"{folder}/*.html"))]
+    found = sorted(run.path.glob(f"{EPISODES}/*.html"), reverse=True)
+    overviews = [path for path in found if path.stem in _OVERVIEWS]
+    replays = [path for path in found if path.stem not in _OVERVIEWS][: _N_PAGES - len(overviews)]
+    for path in (*pages, *overviews, *replays):
+        kind = "replay" if path in replays else path.parent.name
+        is_named = path in overviews or path.stem == kind
+        name = path.stem if is_named else f"{kind} {path.stem}"
+        yield name, f"{address}/{path.parent.name}/{path.name}"
     if (run / CURVE_FILE).is_file():
         yield "curve", f"{address}/{CURVE_FILE}"
     yield "files", f"{address}/"

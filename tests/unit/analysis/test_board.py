@@ -43,7 +43,9 @@ def base(tmp_path: Path) -> Path:
     make_run(base, "100001-E-sac-s2-0002", [0.25, None, 1.0], seed=2)
     changed = {**ALGORITHM, "gamma": 0.5}
     path = make_run(base, "100002-E-sac-s1-0003", [0.5, 0.5], algorithm=changed)
-    (path / "episodes" / "a.html").touch()
+    for page in ("episodes/a", "episodes/episodes", "goals/goals", "whatif/a_goal"):
+        (path / page).parent.mkdir(exist_ok=True)
+        (path / f"{page}.html").touch()
     (path / "curve.png").touch()
     return base
 
@@ -67,9 +69,15 @@ def test_repeats_are_one_group_and_say_what_is_different(base: Path) -> None:
     assert groups == [([0, 1], []), ([2], ["gamma=0.5"])]
     assert board["runs"]["id"] == ["0001", "0002", "0003"]
     assert board["runs"]["links"][2] == [
-        ("replay a", "2026-01-02/100002-E-sac-s1-0003/episodes/a.html"),
-        ("curve", "2026-01-02/100002-E-sac-s1-0003/curve.png"),
-        ("files", "2026-01-02/100002-E-sac-s1-0003/"),
+        (name, f"2026-01-02/100002-E-sac-s1-0003/{address}")
+        for name, address in (
+            ("goals", "goals/goals.html"),
+            ("whatif a_goal", "whatif/a_goal.html"),
+            ("episodes", "episodes/episodes.html"),
+            ("replay a", "episodes/a.html"),
+            ("curve", "curve.png"),
+            ("files", ""),
+        )
     ]
 
 
