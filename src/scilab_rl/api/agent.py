@@ -119,6 +119,8 @@ class Agent:
         self.run = run
         self.cfg = cfg
         self.policy = policy
+        self._memory: tuple[np.ndarray, ...] | None = None  # of a recurrent policy
+        self._n_remembered = 0
 
     def __repr__(self) -> str:
         return f"<Agent {self.run}: {self.cfg.algorithm.name} in {self.cfg.env}>"
@@ -154,12 +156,16 @@ class Agent:
         """The names of what it can be asked with `probe`."""
         return tuple(answerable(self.inspector))
 
-    def predict(self, observation: Observation, *, deterministic: bool = True) -> Any:
+    def predict(
+        self, observation: Observation, *, deterministic: bool = True, begins: bool = False
+    ) -> Any:
         """Return the action for an observation, or one for each of a batch.
 
         Args:
             observation: One of `observation_space`, or a batch of them.
             deterministic: Whether the most likely action is taken, rather than a sample.
+            begins: Whether these are the first observations of episodes: a recurrent policy, which
+                remembers those of the calls before, then forgets them. Others remember nothing.
 
         Shapes:
             observation: those of the space, or ``(batch, ...)`` per entry; result: that of
@@ -176,9 +182,16 @@ class Agent:
             )
         batch, is_single = self._as_batch(observation)
         seen = self.inspector.normalized(batch)
-        actions = self._conversions[0].to_env(
-            self.algorithm.predict(seen, deterministic=deterministic)[0]
+        n = len(next(iter(batch.values())) if isinstance(batch, dict) else batch)
+        if n != self._n_remembered:
+            self._memory, self._n_remembered = None, n
+        actions, self._memory = self.algorithm.predict(
+            seen,
+            state=self._memory,
+            episode_start=np.full(n, begins),
+            deterministic=deterministic,
         )
+        actions = self._conversions[0].to_env(actions)
         return actions[0] if is_single else actions
 
     def q_values(self, observation: Observation, action: npt.ArrayLike) -> np.ndarray:
@@ -356,6 +369,23 @@ class Agent:
         """
         as_table([])  # without pandas, say so before the episodes
         return as_table(self.trajectories(episodes, seed=seed, per=per))
+
+    @isolated()
+    def export(self, folder: str | Path) -> Mapping[str, Any]:
+        """Write the policy for a robot, as ``scilab-rl export --policy`` does.
+
+        Args:
+            folder: Gets the policy for NumPy and ONNX, its runtime and its contract.
+
+        Returns:
+            How exactly the written policy acts as the agent.
+
+        Raises:
+            ConfigError: If such a policy cannot be written.
+        """
+        from scilab_rl.deployment.export import write_policy
+
+        return write_policy(self.run, self.policy, Path(folder))
 
     def close(self) -> None:
         """Close the environment."""

@@ -93,6 +93,24 @@ def test_discrete_actions_are_single_numbers() -> None:
         assert steps[0]["return"] == steps[0]["steps"]
 
 
+def test_a_recurrent_policy_remembers_until_an_episode_begins(
+    reach: scilab_rl.Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Counts:
+        def predict(self, seen, state, episode_start, deterministic):
+            state = np.where(episode_start, 0.0, 0.0 if state is None else state) + 1
+            return state[:, None], state
+
+    agent = scilab_rl.Agent(reach.run, reach.cfg, reach.policy)
+    vars(agent).update(_player=(reach.env, Counts()), inspector=reach.inspector)
+    (seen,) = observations(reach, 1)
+    answers = [agent.predict(seen).item() for _ in range(3)]
+    answers += [agent.predict(seen, begins=begins).item() for begins in (True, False)]
+    assert answers == [1, 2, 3, 1, 2]
+    batch = {key: np.stack([value, value]) for key, value in seen.items()}
+    assert agent.predict(batch).ravel().tolist() == [1, 1]
+
+
 def test_probes_are_asked_by_name(reach: scilab_rl.Agent) -> None:
     first, second = observations(reach, 2)
     assert {"q_value", "value", "entropy", "td_error", "goal_distance"} <= set(reach.probes)
