@@ -30,6 +30,18 @@ from scilab_rl.metrics.names import FRAMEWORK_METRICS, INTRINSIC_METRICS
 
 # What people subclass, call or read, by page section.
 API = {
+    "From Python": (
+        "scilab_rl.train",
+        "scilab_rl.Run",
+        "scilab_rl.runs",
+        "scilab_rl.load",
+        "scilab_rl.Agent",
+        "scilab_rl.EvaluationSummary",
+        "scilab_rl.compare",
+        "scilab_rl.ComparisonSummary",
+        "scilab_rl.goals",
+        "scilab_rl.GoalSummary",
+    ),
     "Algorithms": (
         "scilab_rl.learning.base.OneFileAlgorithm",
         "scilab_rl.learning.off_policy.OffPolicyAlgorithm",

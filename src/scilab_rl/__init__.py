@@ -23,6 +23,7 @@ TYPE_CHECKING = False  # that of `typing`, whose import would take longer than a
 if TYPE_CHECKING:
     from scilab_rl.api.agent import Agent, EvaluationSummary, load
     from scilab_rl.api.comparison import ComparisonSummary, compare
+    from scilab_rl.api.goals import GoalSummary, goals
     from scilab_rl.api.run import Run, runs, train
     from scilab_rl.errors import ConfigError, ScilabRLError
 
@@ -33,16 +34,18 @@ _API = {
     "ComparisonSummary": "scilab_rl.api.comparison",
     "ConfigError": "scilab_rl.errors",
     "EvaluationSummary": "scilab_rl.api.agent",
+    "GoalSummary": "scilab_rl.api.goals",
     "Run": "scilab_rl.api.run",
     "ScilabRLError": "scilab_rl.errors",
     "compare": "scilab_rl.api.comparison",
+    "goals": "scilab_rl.api.goals",
     "load": "scilab_rl.api.agent",
     "runs": "scilab_rl.api.run",
     "train": "scilab_rl.api.run",
 }
 __all__ = [
-    "Agent", "ComparisonSummary", "ConfigError", "EvaluationSummary", "Run", "ScilabRLError",
-    "__version__", "compare", "load", "runs", "train",
+    "Agent", "ComparisonSummary", "ConfigError", "EvaluationSummary", "GoalSummary", "Run",
+    "ScilabRLError", "__version__", "compare", "goals", "load", "runs", "train",
 ]  # fmt: skip
 
 

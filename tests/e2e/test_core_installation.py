@@ -113,6 +113,23 @@ def test_agents_play_or_name_the_extra_that_they_need(core_alone: Path, tmp_path
     assert done.returncode == 2 and 'pip install "scilab-rl[jax]"' in done.stderr
 
 
+def test_the_api_works_and_tables_name_the_extra_that_they_need(
+    core_alone: Path, tmp_path: Path
+) -> None:
+    code = (
+        "import scilab_rl\n"
+        f"run = scilab_rl.train('{TINY[4:]}', 'random', n_epochs=1, eval_after_n_steps=30)\n"
+        "assert run.plot()._repr_png_() and run.epochs\n"
+        "try:\n    run.metrics\nexcept scilab_rl.ScilabRLError as error:\n    print(error)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, text=True, capture_output=True, check=False,
+        env=quiet_environment(PYTHONPATH=f"{core_alone}:{ROOT / 'src'}"),
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert 'pip install "scilab-rl[pandas]"' in done.stdout
+
+
 @pytest.mark.slow
 def test_all_that_reports(core_alone: Path, tmp_path: Path) -> None:
     """Performance tests, films and recorded episodes, with the simulator of the core."""

@@ -44,3 +44,15 @@ def test_wheel_trains_in_an_empty_folder(tmp_path: Path) -> None:
     played = run([*program, "play", "agent:Reach1DOF", "--episodes", "2"])
     assert played.returncode == 0, played.stderr
     assert "success" in played.stdout
+    code = (
+        "import sys, scilab_rl\n"
+        "assert not {'torch', 'numpy', 'gymnasium'} & set(sys.modules)\n"
+        "import gymnasium; gymnasium.spec('Blocks-o2-gripper_above-v1')\n"
+        "run = scilab_rl.Run('last')\n"
+        "agent = scilab_rl.load('agent:Reach1DOF')\n"
+        "observation, _ = agent.make_env().reset(seed=1)\n"
+        "print(len(run.epochs), agent.predict(observation).shape, agent.evaluate(1).n_episodes)"
+    )
+    scripted = run([sys.executable, "-c", code])
+    assert scripted.returncode == 0, scripted.stderr
+    assert scripted.stdout.split("\n")[0] == "2 (1,) 1"

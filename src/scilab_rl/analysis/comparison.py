@@ -19,14 +19,22 @@ from scilab_rl.analysis.estimates import (
     seeds_needed,
     smallest_p,
 )
-from scilab_rl.analysis.groups import FAILED, INCOMPLETE, UNFINISHED, Group, RunRecord
+from scilab_rl.analysis.groups import (
+    FAILED,
+    INCOMPLETE,
+    REWARD_TYPE,
+    SUCCESS,
+    UNFINISHED,
+    Group,
+    RunRecord,
+)
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.results import PRUNED, SOLVED
 from scilab_rl.run.directory import RunDirectory
 from scilab_rl.run.provenance import fingerprint_differences
 from scilab_rl.search.scores import Curve, auc, steps_to_threshold
 
-SUCCESS, REWARD = "eval/success_rate", "eval/mean_reward"
+REWARD = "eval/mean_reward"
 _SUCCESS_METRICS = ("eval/success_rate", "eval/success_once_rate")
 SCORES = ("final", "auc", "steps_to_threshold")
 _LAST = 3  # evaluations that make the final value
@@ -162,6 +170,8 @@ def compare(groups: Sequence[Group], settings: ComparisonSettings) -> Comparison
     tasks = _common_tasks(groups, usable, notes)
     usable = [[run for run in runs if run.task in tasks] for runs in usable]
     metric = _metric(usable, settings.metric)
+    if metric == REWARD:
+        _refuse_other_rewards([run for runs in usable for run in runs])
     if len(tasks) > 1 and metric != SUCCESS:
         notes.append(f"the scale of {metric} differs between environments: do not trust its mean")
     horizon = {
@@ -371,6 +381,15 @@ def _metric(usable: Sequence[Sequence[RunRecord]], wanted: str | None) -> str:
             f"{listing(common)}."
         )
     return name
+
+
+def _refuse_other_rewards(runs: Sequence[RunRecord]) -> None:
+    varying = _varying(runs) & {f"env_kwargs.{REWARD_TYPE}"}
+    if varying:
+        raise ConfigError(
+            f"The runs learned from different rewards ({listing(varying)}), so their mean rewards "
+            f"do not compare; {SUCCESS} does."
+        )
 
 
 def _about_runs(group: Group) -> list[str]:

@@ -29,6 +29,7 @@ from scilab_rl.search.folders import STUDIES, study_names
 from scilab_rl.tracking.console import is_interactive
 
 _MANY = 50  # runs that are read without showing how many are left
+SUCCESS, REWARD_TYPE = "eval/success_rate", "reward_type"
 FAILED, UNFINISHED = "failed", ("running", "interrupted")
 # In no estimate: what crashed, what has not ended, and what a study has cut off.
 INCOMPLETE = (FAILED, *UNFINISHED, PRUNED)
@@ -40,7 +41,8 @@ class RunRecord:
 
     Attributes:
         path: Its folder.
-        task: Environment and its arguments: only runs of the same task are compared.
+        task: Environment and its arguments: only runs of the same task are compared. Where success
+            is measured, the type of the reward does not belong to it.
         env: Id of the environment.
         algorithm: Name of the algorithm.
         seed: Its seed.
@@ -154,11 +156,13 @@ def read_record(run: RunDirectory) -> RunRecord | None:
     except (ConfigError, TypeError, KeyError):
         return None
     result, rows = run.read_result(), read_epochs(run)
-    kwargs = config.get("env_kwargs") or {}
+    kwargs = dict(config.get("env_kwargs") or {})
     status = FAILED if result is None else result.status
     if status == "running" and not run.is_in_use():
         status = FAILED  # its process is gone
     names = {name for row in rows for name in row if name.startswith(("eval/", "time/train_s"))}
+    if SUCCESS in names:  # which reward was learned from does not change what success is
+        kwargs.pop(REWARD_TYPE, None)
     return RunRecord(
         path=run.path,
         task=env if not kwargs else f"{env} {json.dumps(kwargs, sort_keys=True)}",

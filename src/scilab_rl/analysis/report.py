@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scilab_rl.analysis.comparison import (
-    SUCCESS,
     Comparison,
     Contrast,
     GroupEstimates,
     mean_curve,
 )
 from scilab_rl.analysis.estimates import N_SAMPLES, Estimate, performance_profile
+from scilab_rl.analysis.groups import SUCCESS
 from scilab_rl.charts import Interval, Series
 from scilab_rl.drawing import COLORS
 from scilab_rl.errors import MissingDependencyError

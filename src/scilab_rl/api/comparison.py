@@ -24,7 +24,7 @@ if TYPE_CHECKING:  # heavy
 Runs: TypeAlias = str | Run | Sequence[Run]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class ComparisonSummary:
     """Which group of runs learns better, and how sure that is; a notebook shows it as a page.
 
@@ -65,13 +65,16 @@ class ComparisonSummary:
         """
         return write_reports(self.comparison, Path(folder))
 
+    def __repr__(self) -> str:
+        return f"<ComparisonSummary of {', '.join(g.label for g in self.comparison.groups)}>"
+
     def __str__(self) -> str:
         return "\n".join([*self.conclusions, *(f"Note: {n}" for n in self.comparison.notes)])
 
     def _repr_html_(self) -> str:
         with tempfile.TemporaryDirectory() as folder:
             page = self.save(folder)[0].read_text(encoding="utf-8")
-        return in_frame(page, height=760)
+        return in_frame(page, height=900)
 
 
 def compare(

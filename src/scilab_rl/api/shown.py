@@ -24,12 +24,12 @@ class Page:
         height: Of the frame, in pixels.
     """
 
-    def __init__(self, path: Path, height: int = 620) -> None:
+    def __init__(self, path: Path, height: int = 900) -> None:
         self.path = path
         self.height = height
 
     def __repr__(self) -> str:
-        return f"{type(self).__name__}('{self.path}')"
+        return f"<{type(self).__name__} {self.path.name}>"
 
     def _repr_html_(self) -> str:
         return in_frame(self.path.read_text(encoding="utf-8"), self.height)
@@ -73,6 +73,10 @@ class Figure:
 
     def __init__(self, figure: matplotlib.figure.Figure) -> None:
         self.figure = figure
+
+    def __repr__(self) -> str:
+        labels = (str(line.get_label()) for axes in self.figure.axes for line in axes.lines)
+        return f"<Figure of {', '.join(labels)}>"
 
     @classmethod
     def of_curves(cls, curves: Mapping[str, Sequence[tuple[float, float]]]) -> Figure:

@@ -27,12 +27,14 @@ def make_run(
     n_epochs: int | None = None,
     fingerprint: str = "abc",
     metric: str = "eval/success_rate",
+    reward_type: str | None = None,
     **parameters: object,
 ) -> RunDirectory:
     """Write the files of a run with these evaluations."""
     run = RunDirectory.create(base, env, algorithm, seed)
+    env_kwargs = {} if reward_type is None else {"reward_type": reward_type}
     config = {
-        "env": env, "env_kwargs": {}, "wrappers": [], "seed": seed, "group": group,
+        "env": env, "env_kwargs": env_kwargs, "wrappers": [], "seed": seed, "group": group,
         "tags": list(tags), "algorithm": {"name": algorithm, **parameters},
         "n_epochs": n_epochs or len(curve), "eval_after_n_steps": STEPS,
     }  # fmt: skip

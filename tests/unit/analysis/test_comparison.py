@@ -205,6 +205,18 @@ def test_without_success_the_reward_counts(tmp_path: Path) -> None:
         compare(find_groups(tmp_path, "sac", "td3"), ComparisonSettings("success_rate"))
 
 
+def test_success_compares_whatever_reward_was_learned_from(tmp_path: Path) -> None:
+    make_run(tmp_path, "sac", 1, [0.5] * 3, reward_type="sparse")
+    make_run(tmp_path, "td3", 1, [0.9] * 3, reward_type="dense")
+    groups = find_groups(tmp_path, "sac", "td3")
+    comparison = compare(groups, ComparisonSettings())
+    assert comparison.tasks == ("FetchReach-v4",)
+    assert comparison.contrasts[0].mean.value == pytest.approx(0.4)
+    assert any("env_kwargs.reward_type" in note for note in comparison.notes)
+    with pytest.raises(ConfigError, match=r"different rewards .* eval/success_rate does"):
+        compare(groups, ComparisonSettings("eval/mean_reward"))
+
+
 def test_nothing_in_common_is_an_error(tmp_path: Path) -> None:
     make_run(tmp_path, "sac", 1, [0.5])
     make_run(tmp_path, "td3", 1, [0.5], env="FetchPush-v4")

@@ -190,3 +190,14 @@ def test_an_episode_is_recorded(normalized: scilab_rl.Agent, tmp_path: Path) -> 
 def test_what_is_not_there(name: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"'Reach1DO'|No run 'nothing'"):
         scilab_rl.load(name, base_logdir=tmp_path)
+
+
+def test_goals_are_mapped(reach: scilab_rl.Agent, tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with scilab_rl.load("agent:Reach1DOF") as agent:
+        found = scilab_rl.goals(agent, cells=[3], episodes=1, record=0)
+    assert found.path.is_file() and "success over the goal space: 1 [" in str(found)
+    pandas = pytest.importorskip("pandas")
+    assert isinstance(found.cells, pandas.DataFrame)
+    assert list(found.cells.columns) == ["goal_0", "success", "low", "high", "asked"]
+    assert (found.cells["success"] == 1).all()
