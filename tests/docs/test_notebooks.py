@@ -12,7 +12,8 @@ from docs.notebooks.pages import NOTEBOOKS, Notebook
 
 # What makes a notebook take minutes, and what takes its place here.
 SHORTER = (
-    (r'"n_epochs": 4, "eval_after_n_steps": 250', '"n_epochs": 1, "eval_after_n_steps": 60, "n_test_rollouts": 2'),
+    (r'"n_epochs": 4, "eval_after_n_steps": 250',
+     '"n_epochs": 1, "eval_after_n_steps": 60, "n_test_rollouts": 2'),
     (r'"algorithm.net_arch": \[64, 64\], "algorithm.learning_starts": 100',
      '"algorithm.net_arch": [8], "algorithm.learning_starts": 20'),
     (r"episodes=\d+", "episodes=2"),

@@ -93,9 +93,8 @@ def goals(
         ConfigError: If the environment has no goals, or they cannot be chosen.
     """
     agent = load(agent) if isinstance(agent, str) else agent
-    settings = GoalSettings(
-        None if cells is None else tuple(cells), episodes, None if axes is None else tuple(axes), seed
-    )  # fmt: skip
+    chosen = [None if numbers is None else tuple(numbers) for numbers in (cells, axes)]
+    settings = GoalSettings(chosen[0], episodes, chosen[1], seed)
     saved = [find_policy(agent.run, name) for name in checkpoints]
     return GoalSummary(
         examine(agent.run, agent.policy, settings, checkpoints=saved, n_recorded=record)
