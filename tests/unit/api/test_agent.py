@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
 import scilab_rl
+from scilab_rl.analysis.estimates import success_interval
 from scilab_rl.api.agent import as_batch
 from scilab_rl.config.compose import compose
 from scilab_rl.errors import ConfigError
@@ -193,11 +195,27 @@ def test_what_is_not_there(name: str, tmp_path: Path) -> None:
 
 
 def test_goals_are_mapped(reach: scilab_rl.Agent, tmp_path: Path, monkeypatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    with scilab_rl.load("agent:Reach1DOF") as agent:
-        found = scilab_rl.goals(agent, cells=[3], episodes=1, record=0)
-    assert found.path.is_file() and "success over the goal space: 1 [" in str(found)
-    pandas = pytest.importorskip("pandas")
-    assert isinstance(found.cells, pandas.DataFrame)
+    """What `examine` finds is tested with it; here is what becomes of it."""
+    given = {}
+    study = SimpleNamespace(
+        space=SimpleNamespace(axes=(0,)), grid=SimpleNamespace(centers=[[-0.5], [0.5]]),
+        rates=[success_interval(4, 4), success_interval(1, 4)], asked=np.array([7, 0]),
+        overall=success_interval(5, 8), findings=["not reached: the right."],
+    )  # fmt: skip
+
+    def examine(run, policy, settings, **more):
+        given.update(run=run, policy=policy, settings=settings, **more)
+        return SimpleNamespace(page=tmp_path / "goals.html", study=study)
+
+    (tmp_path / "goals.html").write_text("<p>Goals</p>")
+    monkeypatch.setattr("scilab_rl.api.goals.examine", examine)
+    found = scilab_rl.goals(reach, cells=[2], checkpoints=["finished"], record=1)
+    assert given["settings"].cells == (2,) and given["n_recorded"] == 1
+    assert given["checkpoints"] == [reach.policy]
+    assert str(found).splitlines() == [
+        "success over the goal space: 0.625 [0.306, 0.863]", "not reached: the right.",
+    ]  # fmt: skip
+    assert "&lt;p&gt;Goals" in found._repr_html_()
+    pytest.importorskip("pandas")
+    assert found.cells["success"].tolist() == [1.0, 0.25]
     assert list(found.cells.columns) == ["goal_0", "success", "low", "high", "asked"]
-    assert (found.cells["success"] == 1).all()
