@@ -21,7 +21,7 @@ from scilab_rl.run.parts import render_mode
 from scilab_rl.run.player import load_player
 
 _log = logging.getLogger(__name__)
-_N_ENVS = 24  # side by side; more would take longer to make than they save
+_MOST_ENVS = 24  # side by side; more would take longer to make than they save
 _MOST_SCENES = 50  # that are asked about by default
 
 
@@ -54,7 +54,8 @@ def ask(
     clip = load_clip(recording)
     env, model = load_player(cfg, policy, record=False)
     env.close()
-    envs = make_copies(complete(cfg), _N_ENVS)
+    n_envs = _MOST_ENVS if scene is None else min(_MOST_ENVS, max(n_futures, 2))
+    envs = make_copies(complete(cfg), n_envs)
     try:
         player = FuturePlayer(AgentInspector(model), envs, clip)
         futures, decision = _futures(player, clip, change, scene, n_futures, every)
