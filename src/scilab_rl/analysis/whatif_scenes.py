@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scilab_rl.analysis.whatif import Future
+from scilab_rl.envs.frames import simplify_scene
 from scilab_rl.envs.run_env import RunEnv
 from scilab_rl.envs.scenes import EpisodeScenes, change_goal
 from scilab_rl.recording.records import Clip, encode_picture
@@ -78,6 +79,7 @@ def render_scenes(
         return None
     low, high = np.min(places, axis=0), np.max(places, axis=0)
     env.reset(seed=0)
+    simplify_scene(env)
     extent = float(env.unwrapped.model.stat.extent)  # type: ignore[attr-defined]
     size = max(_ZOOM * float(np.linalg.norm(high - low)), _SMALLEST * extent)
     pictures, view = {}, None

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 import warnings
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium as gym
@@ -16,6 +18,7 @@ from scilab_rl.envs.pictures import PictureForm
 DEFAULT_FPS = 25.0
 FRAME_KEY = "scilab_rl.frame"
 STATE_KEY = "scilab_rl.simulator_state"
+_OF_CONTACTS = ("efc_", "iefc_", "contact")
 CLOSE = "close"
 _NEARER = 0.58  # of the distance of a task's own camera
 _BACKGROUND = (238, 240, 244)
@@ -67,13 +70,14 @@ class FrameCapture:
         """Add the scene after a step to its info."""
         if not self._capturing:
             return
-        state = simulator_state(self.env)
+        memory = simulator_memory(self.env)
         info[FRAME_KEY] = self._frame()
-        if state is not None:
-            # Fetch's renderer runs the constraint solver, which would change the next step in the
-            # last bits: an episode that is watched must be the one that is not.
-            set_simulator_state(self.env, state)
-            info[STATE_KEY] = state
+        if memory is not None:
+            # Fetch's renderer runs the constraint solver and moves all bodies to where they are
+            # now, which would change the next step in the last bits: an episode that is watched
+            # must be the one that is not.
+            set_simulator_memory(self.env, memory)
+            info[STATE_KEY] = memory.state
 
     def _frame(self) -> np.ndarray | str:
         """Return a picture, or why there is none; the first reason stays, so that it is one."""
@@ -157,3 +161,63 @@ def set_simulator_state(env: gym.Env, state: np.ndarray) -> None:
 
     inner: Any = env.unwrapped
     mujoco.mj_setState(inner.model, inner.data, state, int(mujoco.mjtState.mjSTATE_INTEGRATION))
+
+
+@dataclass(frozen=True)
+class SimulatorMemory:
+    """All that MuJoCo holds, with what follows from its state.
+
+    An action may depend on what was derived before the last substep, such as the place of a body,
+    so that a forward pass from the state is not the same.
+
+    Attributes:
+        state: From `simulator_state`.
+        derived: All other arrays of its data, by name.
+        warnings: Its counters of warnings.
+        sites: Where the model has its sites, which renderers move to mark goals. Shapes:
+            ``(n_sites, 3)``.
+    """
+
+    state: np.ndarray
+    derived: dict[str, np.ndarray]
+    warnings: np.ndarray
+    sites: np.ndarray
+
+
+def simulator_memory(env: gym.Env) -> SimulatorMemory | None:
+    """Return all that MuJoCo holds, or None for other simulators."""
+    state = simulator_state(env)
+    if state is None:
+        return None
+    inner: Any = env.unwrapped
+    data = inner.data
+    derived = {name: np.array(getattr(data, name)) for name in _derived_names()}
+    return SimulatorMemory(
+        state, derived, np.array(data.warning.number), inner.model.site_pos.copy()
+    )
+
+
+def set_simulator_memory(env: gym.Env, memory: SimulatorMemory) -> None:
+    """Put MuJoCo back to where `simulator_memory` was taken, here or in a copy of the task."""
+    set_simulator_state(env, memory.state)
+    inner: Any = env.unwrapped
+    inner.data.warning.number[:] = memory.warnings
+    inner.model.site_pos[:] = memory.sites
+    for name, values in memory.derived.items():
+        if (array := getattr(inner.data, name)).shape == values.shape:
+            array[...] = values
+
+
+@functools.cache
+def _derived_names() -> list[str]:
+    """Return the names of MuJoCo's arrays, but for those that each step computes anew."""
+    import mujoco
+
+    data = mujoco.MjData(mujoco.MjModel.from_xml_string("<mujoco/>"))
+    return [
+        name
+        for name in dir(data)
+        if not name.startswith(("_", *_OF_CONTACTS))
+        and isinstance(array := getattr(data, name), np.ndarray)
+        and array.flags.writeable
+    ]

@@ -19,7 +19,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from scilab_rl.envs.frames import set_simulator_state, simulator_state
+from scilab_rl.envs.frames import SimulatorMemory, set_simulator_memory, simulator_memory
 from scilab_rl.envs.run_env import EpisodeStart, RunEnv
 from scilab_rl.envs.types import Observation
 from scilab_rl.envs.wrapper_memory import (
@@ -35,7 +35,6 @@ from scilab_rl.errors import ConfigError
 
 _log = logging.getLogger(__name__)
 _NOT_STATE = (*BASE_ATTRIBUTES, "render_mode", "metadata", "_renderer")
-_OF_CONTACTS = ("efc_", "iefc_", "contact")  # computed anew in each step
 
 
 @dataclass(frozen=True)
@@ -43,34 +42,22 @@ class Snapshot:
     """A scene as data.
 
     Attributes:
-        state: MuJoCo's state, see `frames.simulator_state`.
-        derived: Its other arrays, by name.
-        warnings: Its counters of warnings.
-        sites: Where the model has its sites, which renderers move to mark goals. Shapes:
-            ``(n_sites, 3)``.
+        simulator: All that MuJoCo holds.
         attributes: Of each layer of the environment, by name, see `wrapper_memory.describe`.
         memory: Of the wrappers.
     """
 
-    state: np.ndarray
-    derived: dict[str, np.ndarray]
-    warnings: np.ndarray
-    sites: np.ndarray
+    simulator: SimulatorMemory
     attributes: list[dict[str, object]]
     memory: Memory
 
 
 def take_snapshot(env: gym.Env) -> Snapshot | None:
     """Return the present scene of an environment, or None if its simulator is not MuJoCo."""
-    state = simulator_state(env)
-    if state is None:
+    simulator = simulator_memory(env)
+    if simulator is None:
         return None
-    inner: Any = env.unwrapped
-    data = inner.data
-    derived = {name: np.array(getattr(data, name)) for name in _derived_names(data)}
-    attributes = [_plain_attributes(layer) for layer in _layers(env)]
-    warnings, sites = np.array(data.warning.number), inner.model.site_pos.copy()
-    return Snapshot(state, derived, warnings, sites, attributes, memory_of(env))
+    return Snapshot(simulator, [_plain_attributes(layer) for layer in _layers(env)], memory_of(env))
 
 
 def put_snapshot(env: gym.Env, snapshot: Snapshot) -> None:
@@ -80,14 +67,7 @@ def put_snapshot(env: gym.Env, snapshot: Snapshot) -> None:
         own = vars(layer)
         for name, description in attributes.items():
             setattr(layer, name, rebuilt(description, own.get(name)))
-    set_simulator_state(env, snapshot.state)
-    inner: Any = env.unwrapped
-    data = inner.data
-    data.warning.number[:] = snapshot.warnings
-    inner.model.site_pos[:] = snapshot.sites
-    for name, values in snapshot.derived.items():
-        if (array := getattr(data, name)).shape == values.shape:
-            array[...] = values
+    set_simulator_memory(env, snapshot.simulator)
 
 
 class EpisodeScenes:
@@ -243,16 +223,6 @@ def _refuse_difference(
                 "the recording. Either the environment or its simulator has changed since, or its "
                 "chance does not come from self.np_random (scilab-rl doctor env=NAME tells)."
             )
-
-
-def _derived_names(data: Any) -> list[str]:
-    return [
-        name
-        for name in dir(type(data))
-        if not name.startswith(("_", *_OF_CONTACTS))
-        and isinstance(getattr(data, name), np.ndarray)
-        and getattr(data, name).flags.writeable
-    ]
 
 
 def _layers(env: gym.Env) -> list[gym.Env]:

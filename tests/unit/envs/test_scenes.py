@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from types import SimpleNamespace
 
+import mujoco
 import numpy as np
 import pytest
 
@@ -113,3 +114,24 @@ def test_a_goal_of_another_size_or_in_a_task_without_goals_is_refused():
     plain = make_single_env(RunConfig("TinyBox-v0", {}))
     with pytest.raises(ConfigError, match="has no goals"):
         change_goal(plain, plain.reset(seed=1)[0], np.zeros(2))
+
+
+class Follower(Slider):
+    """A mass that is pushed by where it was a substep ago; its renderer brings that up to date."""
+
+    def apply_action(self, action):
+        super().apply_action(action + 10 * self.data.xpos[-1, 0])
+
+    def render(self):
+        mujoco.mj_forward(self.model, self.data)
+        return np.zeros((8, 8, 3), np.uint8)
+
+
+def test_an_episode_that_is_watched_is_the_one_that_is_not():
+    courses = []
+    for watched in (False, True):
+        env = RunEnv(Follower())
+        env.capture_frames(watched)
+        env.reset(seed=2)
+        courses.append([env.step(np.full(1, 0.5))[0]["observation"] for _ in range(20)])
+    np.testing.assert_array_equal(*courses)
