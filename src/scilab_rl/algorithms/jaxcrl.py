@@ -19,6 +19,8 @@ gamma-soon (2206.07568, lemma 4.1). A goal that is reached surely in k steps has
 the density of one that is reached now; that is where ``steps_to_goal`` comes from:
 
     k = (f(s, a, where s is) - f(s, a, g)) / -log gamma
+
+A goal that is reached only by chance seems farther away than it is: k says at most so many steps.
 """
 
 from __future__ import annotations

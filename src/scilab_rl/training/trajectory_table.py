@@ -25,7 +25,7 @@ _log = logging.getLogger(__name__)
 # The probes whose values are columns, under their own names.
 STEP_METRICS = (
     "value", "q_value", "critic_variance", "td_error", "intrinsic_reward", "entropy", "log_prob",
-    "goal_distance", "success",
+    "similarity", "steps_to_goal", "goal_distance", "success",
 )  # fmt: skip
 MOST_DIMENSIONS = 12
 Row = dict[str, float]
