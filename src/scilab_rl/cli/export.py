@@ -40,6 +40,8 @@ def main(arguments: list[str]) -> int:
         "algorithm": cfg.algorithm.name,
         "run_seed": cfg.seed,
     }
+    if rows and "response" in rows[0]:  # a choice task: `scilab-rl fit` reads the table
+        origin["participant_id"] = run.path.name
     kind = "training" if options.training else f"trials_{options.per}"
     path = options.output or run.outputs / f"{kind}.{options.format}"
     if path.suffix not in (".csv", ".parquet"):
@@ -182,6 +184,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         metavar="BETA",
         help="choose with probability proportional to exp(BETA Q), as a simulated participant",
     )
+    add("--sample", action="store_true", help="draw actions from the policy, not its likeliest one")
     add("--dimensions", type=positive, default=12, help="most numbers of an observation's parts")
     add("--seed", type=int, default=0, help="default: the run's seed plus 1")
     add("--format", choices=("csv", "parquet"), default="csv")

@@ -113,6 +113,8 @@ class CognitiveModel(OneFileAlgorithm):
 
     Attributes:
         parameters: The free parameters, by name.
+        n_stages: Choices per trial of the tasks that it is a model of.
+        chooses_by_chance: Whether tables of its choices draw them from its probabilities.
         values: Their values for acting.
         memory: Of each environment. Shapes: ``(n_envs, ...)`` per leaf.
     """
@@ -120,6 +122,7 @@ class CognitiveModel(OneFileAlgorithm):
     supported_action_spaces = (spaces.Discrete,)
     parameters: ClassVar[Mapping[str, Parameter]]
     n_stages: ClassVar[int] = 1
+    chooses_by_chance: ClassVar[bool] = True
 
     def __init__(self, **common: Any) -> None:
         super().__init__(**common)
@@ -278,6 +281,33 @@ def compiled_step(model: type[CognitiveModel], n_states: int, n_actions: int) ->
     return jax.jit(jax.vmap(step, in_axes=(None, 0, 0)))
 
 
+def log_probabilities(
+    model: type[CognitiveModel],
+    n_states: int,
+    n_actions: int,
+    parameters: Values,
+    seen: Seen,
+) -> Array:
+    """Return the log-probabilities of all responses of one participant, given the trials before.
+
+    Args:
+        model: The model.
+        n_states: States of the task.
+        n_actions: Responses of the task.
+        parameters: Of this participant.
+        seen: What was seen before each choice.
+
+    Shapes:
+        seen: ``(n_choices,)``; result: ``(n_choices, n_actions)``.
+    """
+
+    def scan(memory: Memory, now: Seen) -> tuple[Memory, Array]:
+        each, memory = advance(model, n_states, n_actions, parameters, memory, now)
+        return memory, each
+
+    return jax.lax.scan(scan, begin(model, parameters, n_states, n_actions), seen)[1]
+
+
 def log_likelihoods(
     model: type[CognitiveModel],
     n_states: int,
@@ -286,36 +316,26 @@ def log_likelihoods(
     seen: Seen,
     responses: Array,
 ) -> Array:
-    """Return the log-probability of each choice of one participant, given the trials before it.
-
-    Args:
-        model: The model.
-        n_states: States of the task.
-        n_actions: Responses of the task.
-        parameters: Of this participant.
-        seen: What was seen before each choice.
-        responses: The choices.
+    """Return the log-probabilities of the choices of one participant, as `log_probabilities`.
 
     Shapes:
         seen, responses, result: ``(n_choices,)``.
     """
-
-    def scan(memory: Memory, now: tuple[Seen, Array]) -> tuple[Memory, Array]:
-        before, response = now
-        probabilities, memory = advance(model, n_states, n_actions, parameters, memory, before)
-        return memory, probabilities[response]
-
-    first = begin(model, parameters, n_states, n_actions)
-    first = jax.tree.map(lambda leaf: leaf + jnp.zeros_like(leaf), first)
-    return jax.lax.scan(scan, first, (seen, responses))[1]
+    each = log_probabilities(model, n_states, n_actions, parameters, seen)
+    return jnp.take_along_axis(each, jnp.asarray(responses)[:, None], axis=1)[:, 0]
 
 
-def sample(probabilities: np.ndarray) -> np.ndarray:
-    """Draw a response from each row of probabilities, from NumPy's global generator.
+def sample(probabilities: np.ndarray, rng: np.random.Generator | None = None) -> np.ndarray:
+    """Draw a response from each row of probabilities.
+
+    Args:
+        probabilities: Of the responses.
+        rng: The generator; None: NumPy's global one.
 
     Shapes:
         probabilities: ``(n, n_actions)``; result: ``(n,)``.
     """
     sums = probabilities.cumsum(axis=1)
-    chances = np.random.random((len(sums), 1)) * sums[:, -1:]
+    draw = np.random.random if rng is None else rng.random
+    chances = draw((len(sums), 1)) * sums[:, -1:]
     return (chances >= sums[:, :-1]).sum(axis=1)

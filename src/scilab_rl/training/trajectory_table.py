@@ -10,6 +10,7 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv, VecEnvObs
 
 from scilab_rl.canonical_spaces import conversions
+from scilab_rl.envs.choices.base import COLUMNS_KEY
 from scilab_rl.envs.types import Observation
 from scilab_rl.envs.vec_step import ObservedStep
 from scilab_rl.envs.vectorize import observed_layer
@@ -39,6 +40,7 @@ def collect(
     seed: int,
     *,
     choose: Choose | None = None,
+    sampled: bool = False,
     most_dimensions: int = MOST_DIMENSIONS,
 ) -> list[Row]:
     """Let an agent act and return a row per step.
@@ -47,7 +49,7 @@ def collect(
     agent thought of that very step: ``value`` and ``q_value`` (means over critics),
     ``critic_variance``, ``td_error`` (positive: better than expected), ``intrinsic_reward``,
     ``entropy``, ``log_prob``; for discrete actions also ``q_0``, ``q_1``, ... of all actions. What
-    an algorithm cannot answer has no column.
+    an algorithm cannot answer has no column. In a choice task, the columns of the trial follow.
 
     Args:
         model: The agent.
@@ -55,6 +57,7 @@ def collect(
         n_episodes: How many episodes.
         seed: Of the episodes.
         choose: Returns the action for an observation; None means the agent's most likely one.
+        sampled: Whether that is drawn from the policy instead.
         most_dimensions: So many numbers of each part of an observation.
     """
     inspector = AgentInspector(model)
@@ -64,7 +67,7 @@ def collect(
     task, newest = observed_layer(env), _Newest()
     task.observers.append(newest)
     env.seed(seed)
-    seen, act = env.reset(), _Actor(model, env, choose)
+    seen, act = env.reset(), _Actor(model, env, choose, sampled)
     rows: list[Row] = []
     try:
         for episode in range(n_episodes):
@@ -115,6 +118,7 @@ def _row(
         | {curve.panel: number for curve, number in step_metrics.items()}
         | values
         | {"terminated": terminated, "truncated": bool(seen.truncated[0])}
+        | info.get(COLUMNS_KEY, {})
     )
 
 
@@ -204,8 +208,10 @@ def softmax_choice(model: Algorithm, inverse_temperature: float, seed: int) -> C
 class _Actor:
     """Chooses actions, as the algorithm has them, and carries the memory of a recurrent policy."""
 
-    def __init__(self, model: Algorithm, env: VecEnv, choose: Choose | None) -> None:
-        self._model, self._env, self._choose = model, env, choose
+    def __init__(
+        self, model: Algorithm, env: VecEnv, choose: Choose | None, sampled: bool
+    ) -> None:
+        self._model, self._env, self._choose, self._sampled = model, env, choose, sampled
         self._memory: tuple[np.ndarray, ...] | None = None
 
     def __call__(self, seen: VecEnvObs, *, begins: bool) -> np.ndarray:
@@ -214,7 +220,10 @@ class _Actor:
             chosen = self._choose(single(observed_layer(self._env).observations, 0))
             return conversions(self._env)[0].from_env(np.asarray(chosen)[None])
         action, self._memory = self._model.predict(
-            seen, state=self._memory, episode_start=np.array([begins]), deterministic=True
+            seen,
+            state=self._memory,
+            episode_start=np.array([begins]),
+            deterministic=not self._sampled,
         )
         return action
 

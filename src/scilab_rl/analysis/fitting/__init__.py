@@ -1,0 +1,1 @@
+"""Fitting cognitive models to choices: estimates, comparison of models, recovery, predictions."""

@@ -1,0 +1,158 @@
+"""Hierarchical Bayesian estimates: participants come from a population whose mean is estimated too.
+
+The real-scale parameters of participants are normal around a group mean, with priors on both; NUTS
+(Hoffman & Gelman, 2014, JMLR 15) of NumPyro samples all of them. Participants are written as
+mean + sd * z, with standard normal z, which samples well also where a participant says little.
+R-hat and effective sizes are those of Vehtari et al. (2021, Bayesian Analysis 16), per split chain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from scilab_rl.analysis.fitting.estimation import Fit, natural
+from scilab_rl.errors import MissingDependencyError
+from scilab_rl.learning.cognitive import CognitiveModel, Seen, log_likelihoods
+
+MOST_R_HAT, LEAST_EFFECTIVE = 1.01, 400.0
+
+
+@dataclass(frozen=True)
+class Posterior:
+    """Samples of a hierarchical model.
+
+    Attributes:
+        name: The model's name.
+        model: The model.
+        group: Group means. Shapes: ``(n_samples, n_parameters)``, on the real scale.
+        spread: Standard deviations between participants. Shapes: as ``group``.
+        participants: Shapes: ``(n_samples, n_participants, n_parameters)``, on the real scale.
+        r_hat: The largest of each kind of quantity.
+        effective: The smallest effective sample size of each kind.
+        n_divergent: Divergent transitions after the warm-up.
+    """
+
+    name: str
+    model: type[CognitiveModel]
+    group: np.ndarray
+    spread: np.ndarray
+    participants: np.ndarray
+    r_hat: Mapping[str, float]
+    effective: Mapping[str, float]
+    n_divergent: int
+
+    @property
+    def problem(self) -> str:
+        """Why nothing may be concluded; empty if the chains agree."""
+        largest, smallest = max(self.r_hat.values()), min(self.effective.values())
+        found = []
+        if not largest <= MOST_R_HAT:
+            found.append(f"R-hat is {largest:.3f}, above {MOST_R_HAT}")
+        if not smallest >= LEAST_EFFECTIVE:
+            found.append(f"an effective sample size is {smallest:.0f}, below {LEAST_EFFECTIVE:.0f}")
+        if self.n_divergent:
+            found.append(f"{self.n_divergent} transitions diverged")
+        return "; ".join(found)
+
+    def group_rows(self) -> list[dict[str, object]]:
+        """Return the group means on the parameters' own scales, with 95 % intervals."""
+        values = natural(self.model, self.group)
+        return [
+            {
+                "model": self.name,
+                "parameter": name,
+                "group mean": float(np.median(draws)),
+                "low": float(np.quantile(draws, 0.025)),
+                "high": float(np.quantile(draws, 0.975)),
+            }
+            for name, draws in values.items()
+        ]
+
+
+def sample_posterior(
+    fitted: Fit,
+    *,
+    n_warmup: int = 500,
+    n_samples: int = 500,
+    n_chains: int = 4,
+    seed: int = 0,
+) -> Posterior:
+    """Sample the hierarchical model of all participants.
+
+    Args:
+        fitted: Estimates of single participants, at which the chains begin.
+        n_warmup: Steps per chain that tune the sampler.
+        n_samples: Steps per chain that are kept.
+        n_chains: Chains, which are sampled side by side.
+        seed: Of the sampler.
+
+    Raises:
+        MissingDependencyError: If NumPyro is not installed.
+    """
+    try:
+        import numpyro
+        from numpyro import distributions as dist
+        from numpyro.diagnostics import summary
+        from numpyro.infer import MCMC, NUTS, init_to_value
+    except ImportError as error:
+        raise MissingDependencyError("numpyro", "cognition", "for hierarchical=true") from error
+
+    mean, sd = (
+        jnp.array([getattr(p, name) for p in fitted.model.parameters.values()])
+        for name in ("mean", "sd")
+    )
+    shape, choices = fitted.real.shape, _log_likelihood(fitted)
+
+    def population() -> None:
+        mu = numpyro.sample("group", dist.Normal(mean, sd).to_event(1))
+        sigma = numpyro.sample("spread", dist.HalfNormal(sd).to_event(1))
+        z = numpyro.sample("z", dist.Normal(0.0, 1.0).expand(shape).to_event(2))
+        numpyro.factor("choices", choices(numpyro.deterministic("participants", mu + sigma * z)))
+
+    sampler = MCMC(
+        NUTS(population, init_strategy=init_to_value(values=_start(fitted))),
+        num_warmup=n_warmup,
+        num_samples=n_samples,
+        num_chains=n_chains,
+        chain_method="vectorized",
+        progress_bar=False,
+    )
+    sampler.run(jax.random.key(seed), extra_fields=("diverging",))
+    chains = sampler.get_samples(group_by_chain=True)
+    chains = {name: np.asarray(chains[name]) for name in ("group", "spread", "participants")}
+    quality = summary(chains)
+    flat = {name: draws.reshape(-1, *draws.shape[2:]) for name, draws in chains.items()}
+    return Posterior(
+        name=fitted.name,
+        model=fitted.model,
+        **flat,
+        r_hat={name: float(np.max(quality[name]["r_hat"])) for name in chains},
+        effective={name: float(np.min(quality[name]["n_eff"])) for name in chains},
+        n_divergent=int(sampler.get_extra_fields()["diverging"].sum()),
+    )
+
+
+def _start(fitted: Fit) -> dict[str, Any]:
+    mu, sigma = fitted.real.mean(axis=0), np.maximum(fitted.real.std(axis=0), 0.1)
+    return {"group": mu, "spread": sigma, "z": (fitted.real - mu) / sigma}
+
+
+def _log_likelihood(fitted: Fit) -> Any:
+    """Return a function of all participants' parameters: the log-probability of all choices."""
+    panel, parameters = fitted.panel, fitted.model.parameters
+
+    def one(x: Any, seen: Seen, responses: Any, counts: Any) -> Any:
+        values = {name: p.from_real(x[k]) for k, (name, p) in enumerate(parameters.items())}
+        each = log_likelihoods(
+            fitted.model, panel.n_states, panel.n_actions, values, seen, responses
+        )
+        return (each * counts).sum()
+
+    data = jax.tree.map(jnp.asarray, (panel.seen, panel.responses, panel.counts))
+    return lambda x: jax.vmap(one)(x, *data).sum()
