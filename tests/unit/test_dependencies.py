@@ -27,6 +27,8 @@ BEHIND_AN_EXTRA = {
     "learning/jax_engine.py", "learning/jax_off_policy.py",
     "algorithms/jaxcrl.py", "algorithms/jaxsac.py", "algorithms/jaxtd3.py", "learning/cognitive.py",
     *(f"algorithms/models/{name}.py" for name in MODELS),
+    *(f"analysis/fitting/{name}.py" for name in ("estimation", "hierarchical", "selection")),
+    "analysis/fitting/simulation.py",
     "envs/suites/highway_env.py", "envs/suites/metaworld.py", "envs/suites/panda_gym.py",
     "testing/algorithms.py", "testing/models.py",
 }  # fmt: skip

@@ -64,7 +64,9 @@ def main(arguments: list[str]) -> int:
         print_json({"models": model_rows(results), "groups": group_rows(results)})
     else:
         optional = ("parameters", "AIC", "converged")
-        print_rows(MODEL_COLUMNS, model_rows(results), optional=optional, if_any=("frequency", "PXP"))
+        print_rows(
+            MODEL_COLUMNS, model_rows(results), optional=optional, if_any=("frequency", "PXP")
+        )
         print_rows(("model", "parameter", "group mean", "low", "high"), group_rows(results))
         for line in (*conclusions(results), *results.recovery):
             write(line)

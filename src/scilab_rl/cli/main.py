@@ -34,12 +34,9 @@ COMMANDS = {
     "compare": "compare algorithms, groups or runs: which learns better",
     "experiment": "train the missing runs of a comparison, then compare",
     "performance": "test whether everything still learns as well as before",
-<<<<<<< HEAD
     "goals": "map where in its goal space an agent fails, and what it expects",
-=======
-    "fit": "fit cognitive models to choices of people or agents, and compare them",
-    "recover": "simulate and fit: can a design tell parameters and models apart?",
->>>>>>> 847f44b (Fitting cognitive models to choices, and recovery of parameters and models)
+    "fit": "fit cognitive models to choices and compare them",
+    "recover": "simulate and fit: are parameters and models told apart?",
     "export": "write observations, actions and metrics of an agent as a table",
     "mlflow": "browse the learning curves of all runs with MLflow",
     "sync": "send runs to a tracker that was unavailable while they trained",

@@ -208,9 +208,7 @@ def softmax_choice(model: Algorithm, inverse_temperature: float, seed: int) -> C
 class _Actor:
     """Chooses actions, as the algorithm has them, and carries the memory of a recurrent policy."""
 
-    def __init__(
-        self, model: Algorithm, env: VecEnv, choose: Choose | None, sampled: bool
-    ) -> None:
+    def __init__(self, model: Algorithm, env: VecEnv, choose: Choose | None, sampled: bool) -> None:
         self._model, self._env, self._choose, self._sampled = model, env, choose, sampled
         self._memory: tuple[np.ndarray, ...] | None = None
 

@@ -6,14 +6,14 @@ import json
 import numpy as np
 import pytest
 
+from scilab_rl.algorithms.models.hybrid import HYBRID
+from scilab_rl.algorithms.models.rescorlawagner import RESCORLAWAGNER
 from scilab_rl.analysis.fitting import recovery, report
 from scilab_rl.analysis.fitting.estimation import fit, natural, prior_draws
 from scilab_rl.analysis.fitting.panel import make_panel, read_panel
 from scilab_rl.analysis.fitting.predictive import learning_curve, stay_probabilities
 from scilab_rl.analysis.fitting.selection import choice_probabilities, held_out, select
 from scilab_rl.analysis.fitting.simulation import simulate
-from scilab_rl.algorithms.models.hybrid import HYBRID
-from scilab_rl.algorithms.models.rescorlawagner import RESCORLAWAGNER
 from scilab_rl.analysis.report import write_table
 from scilab_rl.errors import ConfigError
 
@@ -53,7 +53,7 @@ def test_blocks_begin_anew_and_forced_choices_do_not_count():
 
 
 def test_shorter_participants_are_filled_up_with_choices_that_do_not_count():
-    rows = rows_of((0, 1), (1, 0)) + [{"participant_id": "b", "response": 1, "feedback": 1}]
+    rows = [*rows_of((0, 1), (1, 0)), {"participant_id": "b", "response": 1, "feedback": 1}]
     panel = make_panel(rows)
     assert panel.participants == ("a", "b")
     assert panel.counts.tolist() == [[1, 1], [1, 0]]
