@@ -94,14 +94,20 @@ class BoardReader:
 
     def version(self) -> str:
         """Return a text that changes whenever a run does."""
-        states = [(str(run.path), _state(run)) for run in all_runs(self.base)]
+        states = [(str(run.path), self._state(run)) for run in all_runs(self.base)]
         return hashlib.sha256(repr(states).encode()).hexdigest()[:16]
 
     def _read_run(self, run: RunDirectory, studies: Sequence[str]) -> BoardRun:
-        state = _state(run)
+        state = self._state(run)
         if run.path not in self._known or self._known[run.path][0] != state:
             self._known[run.path] = state, _read(run, studies, self.base)
         return self._known[run.path][1]
+
+    def _state(self, run: RunDirectory) -> object:
+        """Return what changes with a run: its files, and whether one that trains still does."""
+        known = self._known.get(run.path)
+        trains = known is not None and known[1].facts["status"] == "running"
+        return _state(run), trains and run.is_in_use()
 
 
 def write_board(base: Path, path: Path | None = None) -> Path:

@@ -14,6 +14,7 @@ import pytest
 
 from scilab_rl.analysis.board import BoardReader, write_board
 from scilab_rl.cli.board import BoardServer
+from scilab_rl.run.directory import RunDirectory
 
 ALGORITHM = {"name": "sac", "_target_": "x.SAC", "gamma": 0.9}
 
@@ -134,6 +135,18 @@ def test_only_changed_runs_are_read_again(base: Path, monkeypatch: pytest.Monkey
     board = reader.read()
     assert read == ["0001", "0004"]
     assert decode(board, "eval/success_rate")[0] == [0.0, 0.5, 0.75]
+
+
+def test_a_run_that_dies_is_noticed_although_no_file_changes(tmp_path: Path) -> None:
+    run = RunDirectory(make_run(tmp_path, "100000-a", [0.5], "running"))
+    reader = BoardReader(tmp_path)
+    with run.in_use():
+        assert reader.read()["runs"]["status"] == ["running"]
+        reader.read()
+        alive = reader.version()
+        assert reader.version() == alive
+    assert reader.version() != alive
+    assert reader.read()["runs"]["status"] == ["crashed"]
 
 
 def test_the_server_answers_this_machine_only(base: Path) -> None:
