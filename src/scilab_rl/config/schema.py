@@ -143,6 +143,9 @@ class RunConfig:
     save_model_freq: int = _neutral(
         0, "environment steps between checkpoints, one more at the end; 0: when stopped", low=0
     )
+    keep_policies: int = _neutral(
+        0, "epochs between policies that are kept besides the best and the last; 0: none", low=0
+    )
     info: str = _neutral("", "a note to yourself, kept with the run")
 
     mlflow: bool | Literal["auto"] = _neutral(

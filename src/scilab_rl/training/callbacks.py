@@ -18,7 +18,7 @@ from scilab_rl.results import PRUNED, SOLVED
 from scilab_rl.tracking.base import Tracker
 from scilab_rl.training import resume
 from scilab_rl.training.interruption import StopRequest, TrainingInterrupted
-from scilab_rl.training.policy import BEST, save_policy
+from scilab_rl.training.policy import BEST, KEPT, save_policy
 from scilab_rl.training.snapshot import Snapshot
 from scilab_rl.training.state import RunState
 
@@ -90,6 +90,25 @@ class KeepBest(RunCallback):
         if is_better(candidate, self.state.best):
             self.state.best = candidate
             save_policy(self.state.model, self.directory, epoch)
+
+
+class KeepPolicies(RunCallback):
+    """Keeps the policy of the first epoch and of every so many.
+
+    Args:
+        state: With the policy.
+        run_dir: Where ``rl_model_epoch_0010`` and the like go.
+        every: Epochs between kept policies; 0: none is kept.
+    """
+
+    def __init__(self, state: RunState, run_dir: Path, every: int) -> None:
+        super().__init__()
+        self.state, self.run_dir, self.every = state, run_dir, every
+
+    def on_epoch(self, step: int, epoch: int, values: Mapping[str, float]) -> None:
+        """Save the policy if it is one of these."""
+        if self.every and (epoch == 1 or epoch % self.every == 0):
+            save_policy(self.state.model, self.run_dir / f"{KEPT}{epoch:04d}", epoch)
 
 
 class EarlyStop(RunCallback):

@@ -31,6 +31,7 @@ from scilab_rl.training.callbacks import (
     Checkpoints,
     EarlyStop,
     KeepBest,
+    KeepPolicies,
     ReportToTrackers,
     RunCallback,
 )
@@ -89,9 +90,10 @@ class Trainer(CallbackList):
         self._instabilities = InstabilityRecord(run_dir / "unstable")
         train_env.observers += [statistics, self._instabilities]
         keep_best, report = KeepBest(self.state, run_dir), ReportToTrackers(trackers)
+        kept = KeepPolicies(self.state, run_dir, cfg.keep_policies)
         stop = cfg.early_stop_data_column, cfg.early_stop_threshold, cfg.early_stop_last_n
         early_stop = EarlyStop(self.state.store, *stop)
-        super().__init__([keep_best, report, early_stop, self.checkpoints])
+        super().__init__([keep_best, kept, report, early_stop, self.checkpoints])
         self._stop_reason: str | None = None
         self._epoch_started = 0.0
         self._epoch_first_step = 0

@@ -11,7 +11,7 @@ from scilab_rl.learning.algorithm import Algorithm
 from scilab_rl.training import checkpoint, sb3_archives
 from scilab_rl.training.snapshot import capture, restore
 
-BEST, FINISHED = "rl_model_best", "rl_model_finished"
+BEST, FINISHED, KEPT = "rl_model_best", "rl_model_finished", "rl_model_epoch_"
 _MEMORY = "wrappers"
 _log = logging.getLogger(__name__)
 

@@ -16,6 +16,7 @@ from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs.vectorize import make_eval_env, make_train_env
 from scilab_rl.metrics.store import MetricStore
 from scilab_rl.tracking.base import TrackerGroup
+from scilab_rl.training import checkpoint
 from scilab_rl.training.callbacks import EarlyStop, KeepBest, Pruning, RunCallback
 from scilab_rl.training.loop import Outcome, Trainer
 
@@ -74,6 +75,13 @@ def test_callbacks_hear_of_everything_in_order(tmp_path: Path) -> None:
     assert trainer.state.store.steps == [20, 40, 60]
     statistics = trainer.state.statistics
     assert counter.total == pytest.approx(sum(statistics.episode_returns) + statistics.returns[0])
+
+
+def test_policies_of_some_epochs_are_kept(tmp_path: Path) -> None:
+    trainer = make_trainer(tmp_path, keep_policies=2, n_epochs=5)
+    trainer.learn()
+    kept = {p.name: checkpoint.verify(p)["step"] for p in tmp_path.glob("rl_model_epoch_*")}
+    assert kept == {f"rl_model_epoch_000{epoch}": 20 * epoch for epoch in (1, 2, 4)}
 
 
 @pytest.mark.parametrize(
