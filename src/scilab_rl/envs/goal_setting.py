@@ -44,29 +44,32 @@ def reset_with_goal(env: gym.Env, *, seed: int | None, options: Info | None) -> 
     its goal last: the goal is drawn and then replaced.
     """
     chosen = None if options is None else options.get(OPTION)
-    owner = None if chosen is None else _goal_owner(env)
-    if owner is None:
+    found = None if chosen is None else _goal_owner(env)
+    if found is None:
         return env.reset(seed=seed, options=options)
+    owner, name = found
     goal = np.asarray(chosen)
     rest = {key: value for key, value in (options or {}).items() if key != OPTION} or None
     if callable(getattr(owner, "_sample_goal", None)):
         with _sampled(owner, goal):
             return env.reset(seed=seed, options=rest)
     observation, info = env.reset(seed=seed, options=rest)
-    owner.goal = goal.astype(owner.goal.dtype).reshape(owner.goal.shape)
+    drawn = getattr(owner, name)
+    setattr(owner, name, goal.astype(drawn.dtype).reshape(drawn.shape))
     if callable(show := getattr(owner, "update_target_site_pos", None)):
         show()
-    return {**observation, OPTION: owner.goal.copy()}, info
+    return {**observation, OPTION: getattr(owner, name).copy()}, info
 
 
-def _goal_owner(env: gym.Env) -> Any:
-    """Return the object whose goal must be replaced; None where the option does it all."""
+def _goal_owner(env: gym.Env) -> tuple[Any, str] | None:
+    """Return whose attribute must be replaced, and its name; None where the option does it all."""
     inner: Any = env.unwrapped
     if isinstance(inner, GoalEnv):
         return None
     for owner in (inner, getattr(inner, "task", None)):  # panda-gym's goal belongs to its task
-        if isinstance(getattr(owner, "goal", None), np.ndarray):
-            return owner
+        for name in ("goal", "_goal"):
+            if isinstance(getattr(owner, name, None), np.ndarray):
+                return owner, name
     return None
 
 
