@@ -45,9 +45,12 @@ setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 bench: $(VENV)/.installed .venv-peers/.installed  ## all benchmarks (hours; BENCH="startup updates": only these)
 	$(BIN)/python benchmarks/all.py $(BENCH)
 
-demo: setup  ## train a Fetch robot arm to reach its goal, then film it (about a minute)
-	$(BIN)/python src/main.py algorithm=jaxsac env=FetchReach-v4 seed=1 $(DEMO)
-	$(BIN)/python src/main.py play last --episodes 20 --record
+demo: setup  ## train a Fetch robot arm to reach its goal, and film it before, during and after (a minute or two)
+	$(BIN)/python src/main.py algorithm=jaxsac env=FetchReach-v4 seed=1 eval_after_n_steps=200 n_epochs=20 early_stop_last_n=6 \
+	  render=record render_freq=4 'render_metrics_train=[]' render_view=close \
+	  'render_metrics_test=[q_values,goal_distance,reward]' $(DEMO)
+	$(BIN)/python src/main.py play last --policy finished --episodes 20 --record
+	$(BIN)/python scripts/learning_clip.py last
 
 check: $(VENV)/.installed  ## format, lint, types and import layers, as CI runs them
 	$(BIN)/ruff format --check .

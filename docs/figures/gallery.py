@@ -16,15 +16,12 @@ import numpy as np
 from PIL import Image
 
 from scilab_rl.api.agent import load
-from scilab_rl.drawing import BACKGROUND
 from scilab_rl.metrics.probes import Observation
-from scilab_rl.recording.movie import MovieFrames, PanelSheet
-from scilab_rl.recording.records import Clip, Record, decode_picture, load_clip
+from scilab_rl.recording.movie import CardFrames, MovieFrames
+from scilab_rl.recording.records import Clip, load_clip
 
 IMAGES = Path(__file__).parents[1] / "images"
 CARDS = IMAGES / "gallery"
-CARD = 360  # pixels, of its width and of the scene's height
-PANEL = 108
 MOST_SCENES = 60
 FRAME, LAST = 100, 2200  # milliseconds
 NEAR, CLOSED = 0.03, 0.06  # metres from gripper to block; between fingers that hold one of 0.05
@@ -88,24 +85,8 @@ def make_hero() -> None:
 
 def make_card(film: Film) -> None:
     """Film an agent: the scene, and below it one curve."""
-    clip = record(film, (film.panel,))
-    sheet = PanelSheet(clip, CARD, PANEL)
-    frames = []
-    for index, scene in enumerate(clip.records):
-        frame = Image.new("RGB", (CARD, CARD + PANEL), BACKGROUND)
-        frame.paste(fitted(scene), (0, 0))
-        frame.paste(sheet.until(index), (0, CARD))
-        frames.append(frame)
-    save(frames, CARDS / f"{film.agent}.webp")
-
-
-def fitted(scene: Record) -> Image.Image:
-    """Return the scene on a square."""
-    picture = Image.fromarray(decode_picture(scene.picture))
-    picture.thumbnail((CARD, CARD), Image.Resampling.LANCZOS)
-    square = Image.new("RGB", (CARD, CARD), BACKGROUND)
-    square.paste(picture, ((CARD - picture.width) // 2, (CARD - picture.height) // 2))
-    return square
+    frames = CardFrames(record(film, (film.panel,)), film.panel)
+    save([frames[index] for index in range(len(frames))], CARDS / f"{film.agent}.webp")
 
 
 def save(frames: Sequence[Image.Image], path: Path) -> None:

@@ -32,6 +32,7 @@ class Series:
         lines: Thin lines, for example one per seed, as x and y; each point gets a mark.
         mean: The thick line, as x and y.
         band: Around it, as x, lower and upper end.
+        points: Marks without a line, as x and y.
         color: Its number in the palette, see `color_variable`.
     """
 
@@ -40,19 +41,22 @@ class Series:
     mean: tuple[Sequence[float], Numbers] | None = None
     band: tuple[Sequence[float], Sequence[float], Sequence[float]] | None = None
     color: int = 0
+    points: tuple[Sequence[float], Numbers] | None = None
 
     @property
     def xs(self) -> list[float]:
         """All places on the horizontal axis."""
-        curves = [*self.lines, *([self.mean] if self.mean else [])]
-        return [x for xs, _ in curves for x in xs]
+        return [x for xs, _ in self._drawn for x in xs]
 
     @property
     def ys(self) -> list[float]:
         """All values that are drawn."""
-        curves = [*self.lines, *([self.mean] if self.mean else [])]
-        values = [y for _, ys in curves for y in ys if _is_number(y)]
+        values = [y for _, ys in self._drawn for y in ys if _is_number(y)]
         return values + [y for ends in (self.band or ())[1:] for y in ends]
+
+    @property
+    def _drawn(self) -> list[tuple[Sequence[float], Numbers]]:
+        return [*self.lines, *(one for one in (self.mean, self.points) if one is not None)]
 
 
 @dataclass(frozen=True)

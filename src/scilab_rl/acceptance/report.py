@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from scilab_rl.acceptance.conditions import REFERENCE
 from scilab_rl.acceptance.results import ERROR, TestResult
 from scilab_rl.acceptance.rules import FAIL, INCONCLUSIVE, PASS, Verdict
 from scilab_rl.acceptance.runner import PerformanceTest
+from scilab_rl.charts import Series
 from scilab_rl.files import write_json, write_text
 from scilab_rl.pages import as_cell, render
 
@@ -156,6 +156,8 @@ def page(outcomes: Sequence[Outcome]) -> str:
             "outcome": outcome.verdict.outcome,
             "message": _message(outcome),
             "curves": _curves(outcome),
+            "metric": outcome.test.conditions.eval_columns,
+            "target": outcome.test.conditions.eval_value,
             "runs": [
                 (
                     run.seed,
@@ -173,27 +175,11 @@ def page(outcomes: Sequence[Outcome]) -> str:
     return render("performance.html", title=title, columns=names, rows=rows, tests=tests)
 
 
-def _curves(outcome: Outcome) -> bytes | None:
-    """Return the learning curves as PNG."""
-    curves = [(run.curve_steps, run.curve) for run in outcome.result.in_order() if run.curve]
-    if not curves:
-        return None
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.5, 2.8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.add_subplot()
-    axes.spines[["top", "right"]].set_visible(False)
-    for steps, values in curves:
-        axes.plot(steps, values, ".-", color="#0072b2", alpha=0.5)
-    target = outcome.test.conditions
-    axes.axhline(target.eval_value, color="#d55e00", linestyle="--", label="target")
-    axes.set(xlabel="environment steps", ylabel=target.eval_columns, xlim=(0, None))
-    axes.legend(fontsize="small")
-    image = io.BytesIO()
-    figure.savefig(image, dpi=100)
-    return image.getvalue()
+def _curves(outcome: Outcome) -> list[Series]:
+    """Return the learning curves of all runs."""
+    runs = [run for run in outcome.result.in_order() if run.curve]
+    lines = [(list(run.curve_steps), list(run.curve)) for run in runs]
+    return [Series("runs", lines)] if lines else []
 
 
 def _message(outcome: Outcome) -> str:

@@ -6,8 +6,8 @@ All that does not move is drawn once per clip and then uncovered step by step.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +32,7 @@ from scilab_rl.recording.records import (
     decode_picture,
     picture_size,
     title_of,
+    value_range,
 )
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ if TYPE_CHECKING:
     from PIL.ImageDraw import ImageDraw
 
 SCENE_BOX = (640, 480)  # pixels; the scene keeps its shape inside
+CARD = 360  # pixels, of a card's width and its scene's height
 COLUMN = 320  # pixels of a column of panels
 HEADER = 32
 _SMALL = 200
@@ -61,21 +63,69 @@ def write_movie(clip: Clip, path: Path) -> None:
     Raises:
         OSError: If not all frames are in the file, for example because the disk is full.
     """
-    import imageio_ffmpeg
-
     frames = MovieFrames(clip)
     shown = [*range(len(frames)), *[len(frames) - 1] * n_held(clip)]
+    encode((frames[index] for index in shown), frames.size, clip.shown_rate, path)
+
+
+def write_side_by_side(
+    clips: Sequence[Clip], titles: Sequence[str], panel: str, path: Path
+) -> None:
+    """Write several clips as one mp4, next to each other: scene, title and one curve of each.
+
+    A clip that ends first stays at its last scene.
+
+    Args:
+        clips: At least one.
+        titles: Written above each.
+        panel: The metric whose curve is drawn.
+        path: Of the video.
+
+    Raises:
+        OSError: If not all frames are in the file.
+    """
+    curves = [curve for clip in clips for curve in clip.curves(panel).values()]
+    cards = [
+        CardFrames(clip, panel, title, value_range(curves))
+        for clip, title in zip(clips, titles, strict=True)
+    ]
+    n_frames = max(map(len, cards))
+    places = [*range(n_frames), *[n_frames - 1] * n_held(clips[0])]
+    frames = (
+        np.concatenate([np.asarray(card[min(place, len(card) - 1)]) for card in cards], axis=1)
+        for place in places
+    )
+    width, height = cards[0].size
+    encode(frames, (width * len(cards), height), clips[0].shown_rate, path)
+
+
+def encode(frames: Iterable[np.ndarray], size: tuple[int, int], rate: float, path: Path) -> None:
+    """Write frames as mp4.
+
+    Args:
+        frames: All of one size. Shapes: each ``(height, width, 3)``, uint8.
+        size: Width and height in pixels, both even.
+        rate: Frames per second.
+        path: Of the video.
+
+    Raises:
+        OSError: If not all frames are in the file.
+    """
+    import imageio_ffmpeg
+
     encoder = imageio_ffmpeg.write_frames(
         str(path),
-        frames.size,
-        fps=clip.shown_rate,
+        size,
+        fps=rate,
         macro_block_size=_EVEN,
         output_params=["-movflags", "+frag_keyframe+empty_moov", "-crf", "23"],
     )
     encoder.send(None)
+    n_frames = 0
     try:
-        for index in shown:
-            encoder.send(frames[index])
+        for frame in frames:
+            encoder.send(np.ascontiguousarray(frame))
+            n_frames += 1
     except OSError as error:  # it holds the whole command, and what ffmpeg has said at its end
         said = str(error).partition("STDERR OUTPUT:")[2].strip().rpartition("\n")[2]
         reason = f": {said}" if said else ""
@@ -86,8 +136,8 @@ def write_movie(clip: Clip, path: Path) -> None:
         n_written, _ = imageio_ffmpeg.count_frames_and_secs(str(path))  # the encoder hides failures
     except RuntimeError:  # it cannot even be opened; the message is all that ffmpeg has to say
         n_written = 0
-    if n_written != len(shown):
-        raise OSError(f"{n_written} of {len(shown)} frames could be written; is the disk full?")
+    if n_written != n_frames:
+        raise OSError(f"{n_written} of {n_frames} frames could be written; is the disk full?")
 
 
 def n_held(clip: Clip) -> int:
@@ -134,7 +184,7 @@ class MovieFrames:
             left, top = ((self.scene_size[i] - scene.size[i]) // 2 for i in (0, 1))
             corner = (self.scene_corner[0] + left, self.scene_corner[1] + top)
             image.paste(scene, corner)
-            self._mark_outcome(ImageDraw.Draw(image), index, corner, scene.size)
+            mark_outcome(ImageDraw.Draw(image), self.clip, index, corner, scene.size)
         if self.sheet is not None:
             image.paste(self.sheet.until(index), (self.scene_size[0], HEADER))
         self._write_header(ImageDraw.Draw(image), record)
@@ -148,27 +198,6 @@ class MovieFrames:
         how = Image.Resampling.NEAREST if is_small else Image.Resampling.LANCZOS
         size = self._scaled(*scene.size)
         return scene if scene.size == size else scene.resize(size, how)
-
-    def _mark_outcome(
-        self, draw: ImageDraw, index: int, corner: tuple[int, int], size: tuple[int, int]
-    ) -> None:
-        """Frame the scenes after which the task is solved, and the last one of a failure."""
-        reached = index > 0 and self.clip.records[index - 1].success
-        if self.clip.records[index].step == 0 or reached is None:
-            return
-        is_end = self.clip.records[index].is_last_scene
-        if not reached and not is_end:
-            return
-        if max(picture_size(self.clip.records[index].picture)) <= _SMALL:
-            return  # nothing may be drawn over a picture of few pixels
-        color, text = (REACHED, "success") if reached else (FAILED, "no success")
-        right, bottom = corner[0] + size[0] - 1, corner[1] + size[1] - 1
-        draw.rectangle((*corner, right, bottom), outline=color, width=3)
-        width = draw.textlength(text, font=font(14))
-        draw.rounded_rectangle(
-            (corner[0] + 12, bottom - 38, corner[0] + 32 + width, bottom - 12), 13, fill=color
-        )
-        draw.text((corner[0] + 22, bottom - 25), text, fill="#ffffff", font=font(14), anchor="lm")
 
     def _scaled(self, width: int, height: int) -> tuple[int, int]:
         return max(1, round(width * self.scale)), max(1, round(height * self.scale))
@@ -184,6 +213,74 @@ class MovieFrames:
             draw.text(
                 (self.size[0] - 12, 9), events, fill=event_color(events), font=letters, anchor="ra"
             )
+
+
+def mark_outcome(
+    draw: ImageDraw, clip: Clip, index: int, corner: tuple[int, int], size: tuple[int, int]
+) -> None:
+    """Frame the scenes after which the task is solved, and the last one of a failure.
+
+    Args:
+        draw: Draws into the frame.
+        clip: The finished clip.
+        index: Of the scene.
+        corner: Left and top of the scene in the frame, in pixels.
+        size: Its width and height.
+    """
+    record, reached = clip.records[index], index > 0 and clip.records[index - 1].success
+    if record.step == 0 or reached is None or not (reached or record.is_last_scene):
+        return
+    if not record.picture or max(picture_size(record.picture)) <= _SMALL:
+        return  # nothing may be drawn over a picture of few pixels
+    color, text = (REACHED, "success") if reached else (FAILED, "no success")
+    right, bottom = corner[0] + size[0] - 1, corner[1] + size[1] - 1
+    draw.rectangle((*corner, right, bottom), outline=color, width=3)
+    width = draw.textlength(text, font=font(14))
+    pill = (corner[0] + 12, bottom - 38, corner[0] + 32 + width, bottom - 12)
+    draw.rounded_rectangle(pill, 13, fill=color)
+    draw.text((corner[0] + 22, bottom - 25), text, fill="#ffffff", font=font(14), anchor="lm")
+
+
+class CardFrames:
+    """The frames of a small picture of a clip: its scene and, below it, one curve.
+
+    Args:
+        clip: The finished clip.
+        panel: The metric.
+        title: Above the scene; empty: none.
+        span: The range of the curve's axis; None: that of the clip.
+    """
+
+    def __init__(
+        self, clip: Clip, panel: str, title: str = "", span: tuple[float, float] | None = None
+    ) -> None:
+        self.clip = Clip(replace(clip.info, panels=(panel,)), clip.records)
+        self.title = title
+        self.top = HEADER if title else 0
+        self.sheet = PanelSheet(self.clip, CARD, _MIN_PANEL_HEIGHT, span)
+        self.size = (CARD, self.top + CARD + _MIN_PANEL_HEIGHT)
+
+    def __len__(self) -> int:
+        return len(self.clip.records)
+
+    def __getitem__(self, index: int) -> Image:
+        """Return the frame of a scene as a Pillow image."""
+        from PIL import Image, ImageDraw
+
+        frame, record = Image.new("RGB", self.size, BACKGROUND), self.clip.records[index]
+        if record.picture:
+            scene = Image.fromarray(decode_picture(record.picture))
+            scale = CARD / max(scene.size)
+            scene = scene.resize(
+                (round(scene.width * scale), round(scene.height * scale)), Image.Resampling.LANCZOS
+            )
+            left, top = (CARD - scene.width) // 2, (CARD - scene.height) // 2
+            frame.paste(scene, (left, self.top + top))
+        frame.paste(self.sheet.until(index), (0, self.top + CARD))
+        draw = ImageDraw.Draw(frame)
+        draw.text((12, 9), self.title, fill=INK, font=font(14))
+        mark_outcome(draw, self.clip, index, (0, self.top), (CARD, CARD))
+        return frame
 
 
 def grid(n_panels: int) -> tuple[int, int]:
@@ -229,13 +326,17 @@ class PanelSheet:
         clip: The finished clip.
         width: Pixels of one column.
         height: Pixels of the sheet.
+        span: The range of all axes; None: that of each metric.
     """
 
-    def __init__(self, clip: Clip, width: int, height: int) -> None:
+    def __init__(
+        self, clip: Clip, width: int, height: int, span: tuple[float, float] | None = None
+    ) -> None:
         names = clip.info.panels
         rows, columns = grid(len(names))
         self.size = (columns * width, height)
         self.n = len(clip.records)
+        self.span = span
         self.breaks = {i for i in range(1, self.n) if clip.records[i].step == 0}
         self.events = [
             (index, event)
@@ -268,7 +369,7 @@ class PanelSheet:
         column, row = divmod(index, rows)
         height = self.size[1] / rows
         curves = clip.curves(name)
-        low, high = clip.range(name)
+        low, high = self.span or clip.range(name)
         return _Panel(
             name,
             curves,

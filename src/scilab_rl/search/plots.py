@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from scilab_rl.drawing import COLORS
 from scilab_rl.search.runs import COMPLETE, FAILED, PRUNED, Run
 from scilab_rl.search.summary import BEATEN, CONTENDER, WINNER, ConfigurationRow, Summary
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_COLORS = {WINNER: "#d55e00", CONTENDER: "#0072b2", BEATEN: "#999999"}
+_COLORS = {WINNER: COLORS[0], CONTENDER: COLORS[5], BEATEN: "#999999"}
 _OTHER = "#cccccc"
 _MOST_CURVES = 6
 
@@ -65,7 +66,7 @@ def draw_configurations(summary: Summary, axes: Axes) -> bool:
     if summary.final_mean is not None:
         axes.errorbar(
             summary.final_mean, -0.35, xerr=_drawable(summary.final_half_width), fmt="D",
-            color="#009e73", capsize=3, label="winner, new seeds",
+            color=COLORS[2], capsize=3, label="winner, new seeds",
         )  # fmt: skip
         axes.legend()
     axes.set_yticks(range(len(rows)), [_short(row) for row in rows])
@@ -76,10 +77,10 @@ def draw_configurations(summary: Summary, axes: Axes) -> bool:
 
 def draw_curves(summary: Summary, axes: Axes) -> bool:
     """Draw the evaluations of the best configurations over training."""
-    curves = _curves_by_configuration(summary.runs)
+    curves = curves_by_configuration(summary.runs)
     shown = [row for row in summary.rows if row.number in curves][:_MOST_CURVES]
     for row in shown:
-        steps, means, errors = _mean_curve(curves[row.number])
+        steps, means, errors = mean_of_runs(curves[row.number])
         (line,) = axes.plot(steps, means, label=_short(row))
         axes.fill_between(
             steps,
@@ -107,7 +108,7 @@ def draw_history(summary: Summary, axes: Axes) -> bool:
                 group = "winner"
             groups[group][0].append(run.number)
             groups[group][1].append(run.scores[0])
-    colors = {"run": _COLORS[BEATEN], "winner": _COLORS[WINNER], "winner, new seeds": "#009e73"}
+    colors = {"run": _COLORS[BEATEN], "winner": _COLORS[WINNER], "winner, new seeds": COLORS[2]}
     for group, (numbers, scores) in groups.items():
         axes.plot(numbers, scores, "o", color=colors[group], label=group)
     for state, mark in ((FAILED, "x"), (PRUNED, "v")):
@@ -193,7 +194,8 @@ def _scores_by_configuration(runs: Iterable[Run]) -> dict[int, list[float]]:
     return scores
 
 
-def _curves_by_configuration(runs: Iterable[Run]) -> dict[int, list[Run]]:
+def curves_by_configuration(runs: Iterable[Run]) -> dict[int, list[Run]]:
+    """Return the complete runs of the search that were evaluated, by configuration."""
     curves = defaultdict(list)
     for run in runs:
         if run.state == COMPLETE and not run.is_final and run.values:
@@ -201,7 +203,7 @@ def _curves_by_configuration(runs: Iterable[Run]) -> dict[int, list[Run]]:
     return curves
 
 
-def _mean_curve(runs: Sequence[Run]) -> tuple[list[int], list[float], list[float]]:
+def mean_of_runs(runs: Sequence[Run]) -> tuple[list[int], list[float], list[float]]:
     """Return steps, means and standard errors; a run that stopped early stays at its last value."""
     steps = max((run.steps for run in runs), key=len)
     columns = [[run.values[min(i, len(run.values) - 1)] for run in runs] for i in range(len(steps))]

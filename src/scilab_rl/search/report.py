@@ -75,7 +75,7 @@ def write_report(storage: StudyStorage) -> Report:
         write_text(directory / TUNED_FILE, tuned_values(summary))
         write_json(directory / WINNER_FILE, {"overrides": winner_overrides(summary)})
     figures = plots.draw_all(summary, directory / "plots")
-    write_text(directory / REPORT, page.render(summary, figures))
+    write_text(directory / REPORT, page.render(summary, figures, directory))
     return Report(summary, directory)
 
 

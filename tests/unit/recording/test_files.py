@@ -15,7 +15,7 @@ from scilab_rl.errors import ConfigError
 from scilab_rl.metrics.probes import Curve
 from scilab_rl.metrics.triggers import parse_trigger
 from scilab_rl.recording.highlights import HighlightRecorder
-from scilab_rl.recording.movie import MovieFrames, n_held
+from scilab_rl.recording.movie import CardFrames, MovieFrames, n_held, write_side_by_side
 from scilab_rl.recording.recorder import ClipRecorder, render_clip_files
 from scilab_rl.recording.records import (
     EpisodeOutcome,
@@ -274,6 +274,17 @@ def test_success_is_marked_in_the_scenes_that_follow_it() -> None:
     left, top = frames.scene_corner
     edges = [tuple(frames[index][top + 1, left + 40]) for index in range(5)]
     assert [edge == green for edge in edges] == [False, False, False, False, True]
+
+
+def test_clips_side_by_side_have_one_axis_and_wait_for_the_longest(tmp_path: Path) -> None:
+    import imageio_ffmpeg
+
+    clips = [make_clip(("reward",), n_steps=2, large=True), make_clip(("reward",), large=True)]
+    write_side_by_side(clips, ["before", "after"], "reward", tmp_path / "x.mp4")
+    n_frames, _ = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "x.mp4"))
+    assert n_frames == 5 + n_held(clips[1])
+    span = value_range([[0.0, 3.0]])
+    assert CardFrames(clips[0], "reward", "before", span).sheet.panels[0].high == span[1]
 
 
 def without_pictures(clip, steps):
