@@ -10,9 +10,15 @@ FALL_METRES = 0.2  # a Fetch block on the floor is 0.4 m lower, a gripper cannot
 
 
 class EpisodeEvents:
-    """Says what can be seen in each scene of an episode for the first time."""
+    """Says what can be seen in each scene of an episode for the first time.
 
-    def __init__(self) -> None:
+    Args:
+        in_space: Whether the environment simulates bodies in space. Elsewhere, each third number
+            of a goal is not a height: a car's goal has velocities and an orientation.
+    """
+
+    def __init__(self, *, in_space: bool) -> None:
+        self._in_space = in_space
         self._first_heights: np.ndarray | None = None
         self._succeeded = False
         self._fell = False
@@ -25,7 +31,7 @@ class EpisodeEvents:
             success: Whether the step before led to success; None for the first scene.
         """
         events = ["episode start"] if self._first_heights is None else []
-        heights = _heights(observation)
+        heights = _heights(observation) if self._in_space else np.zeros(0)
         if self._first_heights is None:
             self._first_heights = heights
         if success is not None and success != self._succeeded:

@@ -21,6 +21,7 @@ from scilab_rl.metrics.success import success_of
 from scilab_rl.recording.records import ClipInfo, Record, encode_picture
 
 _log = logging.getLogger(__name__)
+_SIMULATORS = ("model", "sim")  # MuJoCo's; PyBullet's and CoppeliaSim's
 _ENV = 0  # the environment that is shown
 NO_PICTURE = "Scenes without picture: %s. Their numbers and curves are recorded without it."
 
@@ -136,7 +137,8 @@ class Timeline:
         if self._scene[0] is None and self._n_scenes is None:  # captured from the next reset on
             return
         self._probes = EpisodeProbes(self.inspector, self.metrics.probes, self._warn_once)
-        self._events = EpisodeEvents()
+        in_space = any(self.env.has_attr(name) for name in _SIMULATORS)
+        self._events = EpisodeEvents(in_space=in_space)
         self._last_success = None
         if self._n_scenes is None:
             self._n_scenes = 0

@@ -43,7 +43,7 @@ def test_watched_values_are_those_of_the_step_and_not_the_mean() -> None:
 
 
 def test_success_is_an_event_when_it_changes() -> None:
-    events = EpisodeEvents()
+    events = EpisodeEvents(in_space=True)
     assert events.of_scene(np.zeros(2), None) == ["episode start"]
     assert events.of_scene(np.zeros(2), False) == []
     assert events.of_scene(np.zeros(2), True) == ["success"]
@@ -52,7 +52,7 @@ def test_success_is_an_event_when_it_changes() -> None:
 
 
 def test_object_that_falls_off_the_table_is_an_event_once() -> None:
-    events = EpisodeEvents()
+    events = EpisodeEvents(in_space=True)
 
     def at(height: float) -> list[str]:
         return events.of_scene({"achieved_goal": np.array([1.3, 0.7, height])}, False)
@@ -61,9 +61,15 @@ def test_object_that_falls_off_the_table_is_an_event_once() -> None:
 
 
 def test_goals_that_are_no_places_in_space_cannot_fall() -> None:
-    events = EpisodeEvents()
+    events = EpisodeEvents(in_space=True)
     events.of_scene({"achieved_goal": np.array([5.0, 5.0])}, None)
     assert events.of_scene({"achieved_goal": np.array([-5.0, -5.0])}, None) == []
+
+
+def test_goals_of_a_task_without_bodies_have_no_heights() -> None:
+    events = EpisodeEvents(in_space=False)  # a car: place, velocity, orientation
+    events.of_scene({"achieved_goal": np.array([0.0, 0.0, 3.0, 0.0, 1.0, 0.0])}, None)
+    assert events.of_scene({"achieved_goal": np.array([5.0, 0.0, 0.0, 0.0, 1.0, 0.0])}, None) == []
 
 
 def test_trigger_on_a_number_and_on_a_percentile() -> None:
