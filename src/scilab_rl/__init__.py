@@ -49,13 +49,15 @@ __all__ = [
 ]  # fmt: skip
 
 
-def __getattr__(name: str) -> object:
-    if name not in _API:
-        raise AttributeError(f"module 'scilab_rl' has no attribute '{name}'")
-    import importlib
+if not TYPE_CHECKING:  # type checkers know the names above, and would take any other for one
 
-    found = globals()[name] = getattr(importlib.import_module(_API[name]), name)
-    return found
+    def __getattr__(name: str) -> object:
+        if name not in _API:
+            raise AttributeError(f"module 'scilab_rl' has no attribute '{name}'")
+        import importlib
+
+        found = globals()[name] = getattr(importlib.import_module(_API[name]), name)
+        return found
 
 
 def __dir__() -> list[str]:
