@@ -219,3 +219,12 @@ def test_goals_are_mapped(reach: scilab_rl.Agent, tmp_path: Path, monkeypatch) -
     pytest.importorskip("pandas")
     assert found.cells["success"].tolist() == [1.0, 0.25]
     assert list(found.cells.columns) == ["goal_0", "success", "low", "high", "asked"]
+
+
+def test_a_policy_with_a_memory_is_not_asked_for_a_single_action(
+    reach: scilab_rl.Agent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    observation = observations(reach, 1)[0]
+    monkeypatch.setattr(type(reach.inspector), "has_memory", property(lambda _: True))
+    with pytest.raises(ConfigError, match="remembers its episode"):
+        reach.predict(observation)
