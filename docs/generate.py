@@ -271,9 +271,12 @@ def documented(thing: Any, target: str) -> Iterator[str]:
     if not inspect.isclass(thing):
         return
     for name, member in vars(thing).items():
-        if name.startswith("_") or not (inspect.isfunction(member) and member.__doc__):
+        if name.startswith("_") or not member.__doc__:
             continue
-        yield f"#### `{name}{_short_signature(member)}`\n"
+        if not inspect.isfunction(member) and not isinstance(member, property):
+            continue
+        signature = _short_signature(member) if inspect.isfunction(member) else ""
+        yield f"#### `{name}{signature}`\n"
         yield from markdown_of(inspect.getdoc(member) or "")
 
 
