@@ -395,10 +395,10 @@ def _value_slices(report: GoalReport) -> list[list[dict[str, object]]]:
 def _value_curves(report: GoalReport) -> list[Series]:
     low, high = _ends(report.study, 0)
     curves = []
-    for values in report.values:
+    for color, values in enumerate(report.values):
         numbers = values.maps[0].values[:, 0][:: max(1, values.maps[0].values.size // 128)]
         xs = np.linspace(low, high, len(numbers)).tolist()
-        curves.append(Series(values.name, mean=(xs, numbers.tolist())))
+        curves.append(Series(values.name, mean=(xs, numbers.tolist()), color=color))
     return curves
 
 

@@ -172,11 +172,6 @@ class Grid:
             for edges, index in zip(self.edges, places, strict=True)
         ]
 
-    def random_places(self, cells: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Return a place in each of some cells. Shapes: ``(n,)``; result ``(n, n_axes)``."""
-        sizes = np.array([edges[1] - edges[0] for edges in self.edges])
-        return self.centers[cells] + sizes * rng.uniform(-0.5, 0.5, (len(cells), len(sizes)))
-
     def neighbors(self, cell: int) -> list[int]:
         """Return the cells that share a side with one."""
         place = np.array(np.unravel_index(cell, self.shape))

@@ -29,7 +29,7 @@ class ValueMap:
     Attributes:
         values: Along the first and the second axis; of one axis, one column. Shapes: ``(n, m)``.
         at: The place on the third axis; None where there is none.
-        seconds: How long the networks took.
+        seconds: CPU time of the networks.
     """
 
     values: np.ndarray
@@ -52,9 +52,9 @@ def value_maps(
     for at in _slices(space):
         places = _places(space, at)
         goals = space.goals(places.reshape(-1, places.shape[-1]), rng)
-        begin = time.perf_counter()
+        begin = time.process_time()
         values = inspector.values(_with_goals(start, goals))
-        seconds = time.perf_counter() - begin
+        seconds = time.process_time() - begin
         maps.append(ValueMap(values.reshape(places.shape[:2]), at, seconds))
     return maps
 

@@ -392,22 +392,35 @@ def _failing(
 
     Regions are chosen because they failed, which is partly chance; the new episodes are not.
     """
-    grid, settings = study.grid, study.settings
-    without = study.successes == 0
-    candidates = [
-        (NOT_REACHED, region)
-        for region in grid.regions(without)
-        if len(region) * settings.episodes >= _MOST_BY_CHANCE
-    ]
-    candidates += [(WEAK, region) for region in grid.regions(_is_weak(study) & ~without)]
-    for number, (kind, region) in enumerate(candidates[:_MOST_REGIONS]):
-        cells = rng.choice(region, _N_RETESTED)
-        goals = study.space.goals(grid.random_places(cells, rng), rng)
-        seed = derive_seed(settings.seed, "retest", number)
-        again = play_goals(algorithm, env, cells, goals, seed)
-        rate = success_interval(int(again.successes.sum()), len(again.successes))
-        if rate.high < study.overall.value or study.overall.value == 0:
-            yield Region(kind, region, _words_of_failure(study, kind, region, rate, again))
+    grid = study.grid
+    unreached = np.zeros(grid.n_cells, dtype=bool)
+    for region in grid.regions(study.successes == 0)[:_MOST_REGIONS]:
+        if len(region) * study.settings.episodes >= _MOST_BY_CHANCE:
+            rate, again = _play_again(study, region, algorithm, env, rng)
+            if rate.value == 0:
+                unreached[region] = True
+                yield Region(
+                    NOT_REACHED, region, _words_of_failure(study, NOT_REACHED, region, rate, again)
+                )
+    for region in grid.regions(_is_weak(study) & ~unreached)[:_MOST_REGIONS]:
+        rate, again = _play_again(study, region, algorithm, env, rng)
+        if rate.high < study.overall.value:
+            yield Region(WEAK, region, _words_of_failure(study, WEAK, region, rate, again))
+
+
+def _play_again(
+    study: GoalStudy,
+    region: np.ndarray,
+    algorithm: Algorithm,
+    env: VecEnv,
+    rng: np.random.Generator,
+) -> tuple[Estimate, PlayedGoals]:
+    """Play new episodes with the goals of a region."""
+    cells = rng.choice(region, _N_RETESTED)
+    goals = study.space.goals(study.grid.centers[cells], rng)
+    seed = derive_seed(study.settings.seed, "retest", int(region[0]), len(region))
+    again = play_goals(algorithm, env, cells, goals, seed)
+    return success_interval(int(again.successes.sum()), len(again.successes)), again
 
 
 def _is_weak(study: GoalStudy) -> np.ndarray:

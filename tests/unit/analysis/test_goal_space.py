@@ -38,5 +38,3 @@ def test_cells_and_regions():
     chosen = np.array([True, False, True, False, False, True])
     assert [region.tolist() for region in grid.regions(chosen)] == [[0, 2], [5]]
     assert grid.extent(np.array([0, 2])) == [(0.0, 2.0), (0.0, 1.0)]
-    places = grid.random_places(np.array([5] * 20), np.random.default_rng(0))
-    assert (grid.count(places) == [0, 0, 0, 0, 0, 20]).all()

@@ -36,7 +36,7 @@ def test_a_run_becomes_a_page_tables_and_episodes(run, capsys):
     # All four policies, in the order of training, in one scale.
     steps = [int(step) for step in re.findall(r'data-name="[a-z_0-9]+, after (\d+) steps"', page)]
     assert len(steps) == 4 and steps == sorted(steps) and set(steps) == {60, 120}
-    assert 'type="range"' in page and "ms for one map" in page
+    assert 'type="range"' in page and "ms of CPU time for" in page
     assert "the replay buffer of the training, in the checkpoint step_0000000" in page
     assert "relabels 80 %" in page and "<script src" not in page and "http" not in page
     link = re.search(r'href="(\.\./episodes/goals_001\.html)">goals_001 \(', page)
