@@ -169,7 +169,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         "state), and model=NAME,NAME... [hierarchical=true] [method=map|mle] [env=TASK] [seed=0]",
     )
     add("--warmup", type=positive, default=500, help="steps of each chain before sampling")
-    add("--samples", type=positive, default=500, help="samples of each of the four chains")
+    add("--samples", type=positive, default=1000, help="samples of each of the four chains")
     add("--parquet", action="store_true", help="write the tables as Parquet too")
     add("--output", type=Path, metavar="DIR", help="default: data/fits/NAME")
     return parser.parse_args(arguments)

@@ -50,7 +50,9 @@ class Posterior:
     @property
     def problem(self) -> str:
         """Why nothing may be concluded; empty if the chains agree."""
-        largest, smallest = max(self.r_hat.values()), min(self.effective.values())
+        # NumPy's, because a NaN must not be hidden.
+        largest = float(np.max([*self.r_hat.values()]))
+        smallest = float(np.min([*self.effective.values()]))
         found = []
         if not largest <= MOST_R_HAT:
             found.append(f"R-hat is {largest:.3f}, above {MOST_R_HAT}")
@@ -79,7 +81,7 @@ def sample_posterior(
     fitted: Fit,
     *,
     n_warmup: int = 500,
-    n_samples: int = 500,
+    n_samples: int = 1000,
     n_chains: int = 4,
     seed: int = 0,
 ) -> Posterior:
