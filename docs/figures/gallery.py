@@ -48,7 +48,7 @@ FILMED = (
     Film("FetchPickAndPlace", 5, n_scenes=26), Film("FetchPush", 13, n_scenes=34),
     Film("FetchSlide", 4, n_scenes=44), Film("Blocks1", 3, n_scenes=26),
     Film("FetchReach", 3, "critic_variance", n_scenes=16), Film("Reach1DOF", 3, n_scenes=16),
-    Film("CartPole", 3, "value"), Film("Maze", 3), Film("Parking", 3),
+    Film("CartPole", 3, "value"), Film("Maze", 3), Film("Parking", 2, n_scenes=30),
 )  # fmt: skip
 # The robot knocks the block off the table, where it is caught at its base, and goes after it.
 HERO = Film("FetchPickAndPlace", 3, n_scenes=50)
