@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from contextlib import closing
+from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import numpy as np
@@ -14,7 +15,9 @@ from scilab_rl.envs.vectorize import make_train_env
 from scilab_rl.errors import ConfigError, MissingDependencyError
 from scilab_rl.run.checks import complete
 from scilab_rl.run.demonstrations import collect_demos, parse_demos, prepare_demos
+from scilab_rl.run.directory import RunDirectory
 from scilab_rl.run.parts import make_algorithm
+from scilab_rl.run.run import resume_run, start_run
 from scilab_rl.training import checkpoint
 from scilab_rl.training.snapshot import capture, restore
 
@@ -152,3 +155,23 @@ def test_a_resumed_run_has_the_same_demonstrations(tmp_path) -> None:
 def test_where_there_can_be_none(env, more, message) -> None:
     with pytest.raises(ConfigError, match=message):
         build(env, "cleansac", "scripted:2", *more)
+
+
+def test_a_run_that_is_continued_ends_as_one_that_was_not_interrupted(
+    tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "conf").mkdir()  # Hydra warns where a project folder has none
+    words = [f"env={MAZE}", "algorithm=cleansac", "algorithm.demos=scripted:2", *SMALL, "mlflow=0",
+             "algorithm.net_arch=[8]", "algorithm.batch_size=8", "eval_after_n_steps=130",
+             "n_test_rollouts=1", "++tracking.console.enabled=false", "early_stop_threshold=2",
+             "save_model_freq=1"]  # fmt: skip
+    whole = start_run(compose([*words, "n_epochs=2"]))
+    half = start_run(compose([*words, "n_epochs=1"]))
+    directory = RunDirectory(Path(half.run_dir))
+    # A resumed run needs its demonstrations from nowhere.
+    monkeypatch.setattr("scilab_rl.run.run.collect_demos", None)
+    resumed = resume_run(compose([*words, "n_epochs=2"]), directory)
+    timeless = {k: v for k, v in whole.metrics.items() if not k.startswith("time/")}
+    assert {k: v for k, v in resumed.metrics.items() if k in timeless} == timeless
+    assert "train/critic_loss" in timeless
