@@ -37,7 +37,7 @@ ORACLE = {
     "ppo": _SB3_ALL,
     "qrdqn": _CHOICES,
     "random": _ALL,
-    "recurrentppo": _SB3_ALL,
+    "recurrentppo": "yyyyyyyy--yy---",  # no switches, no dice
     "sac": _SB3_MOVES,
     "td3": _SB3_MOVES,
     "tqc": _SB3_MOVES,

@@ -30,7 +30,7 @@ _ACTION_SPACES: dict[str, tuple[type[spaces.Space], ...]] = {
     "DQN": _DISCRETE,
     "QRDQN": _DISCRETE,
     "PPO": _ANY,
-    "RecurrentPPO": _ANY,
+    "RecurrentPPO": (spaces.Box, spaces.Discrete, spaces.MultiDiscrete),  # its padding is a float
     "A2C": _ANY,
     "TRPO": _ANY,
 }
@@ -118,6 +118,11 @@ def check_pair(
             f"{name} learns to reach goals, and {env_id} has none (Dict observations with "
             f"{', '.join(GOAL_KEYS)}). {_which_can(fitting)}"
         )
+    if _is_recurrent(cls) and _has_dice(observation_space):
+        raise ConfigError(
+            f"{name} cannot read MultiDiscrete observations, which {env_id} has; add "
+            "+flatten_obs=1."
+        )
     problem_of = getattr(cls, "observation_problem", None)
     if problem_of is not None and (why := problem_of(observation_space)):
         raise ConfigError(f"{name} cannot act in {env_id}: {why}")
@@ -159,6 +164,16 @@ def _unreadable(key: str, entry: spaces.Space) -> str | None:
     if is_image_space(entry) and not is_large_image(entry):
         return f"its network for images needs at least {_SMALLEST_IMAGE} x {_SMALLEST_IMAGE} pixels"
     return None
+
+
+def _is_recurrent(cls: type) -> bool:
+    return "MlpLstmPolicy" in getattr(cls, "policy_aliases", ())
+
+
+def _has_dice(space: spaces.Space) -> bool:
+    """Return whether there are MultiDiscrete numbers, for which an LSTM gets no proper size."""
+    parts = space.spaces.values() if isinstance(space, spaces.Dict) else [space]
+    return any(isinstance(part, spaces.MultiDiscrete) for part in parts)
 
 
 def _which_can(fitting: Callable[[], Iterable[str]]) -> str:
