@@ -21,6 +21,8 @@ from scipy.stats import wilcoxon
 
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.workspace import open_project
+from scilab_rl.drawing import COLORS
+from scilab_rl.envs.frames import NEARER, move_camera, simplify_scene
 from scilab_rl.envs.vectorize import make_eval_env
 from scilab_rl.learning.inspector import AgentInspector
 from scilab_rl.recording.gl import choose_backend
@@ -30,6 +32,8 @@ from scilab_rl.run.parts import make_algorithm
 from scilab_rl.training.policy import load_policy
 
 STEPS_PER_EPISODE = 120
+ACTIONS = ("executed", "policy")  # of which the variance is measured
+CROP = np.s_[150:470, 100:]  # pixels of a frame: gripper, block and table
 WINDOW = 10  # steps before and after the fall
 FALL_BEGINS_METRES = 0.03  # below its resting height the block has left the table
 GRIPPER, BLOCK = slice(0, 3), slice(3, 6)  # of FetchPush's observation
@@ -76,7 +80,9 @@ def main() -> None:
     result = _statistics(falls, attempts)
     options.output.parent.mkdir(parents=True, exist_ok=True)
     _draw(falls, result, options.output)
-    options.output.with_suffix(".json").write_text(json.dumps(result, indent=2) + "\n")
+    kept = {name: [_around(fall, name).tolist() for fall in falls] for name in ACTIONS}
+    text = json.dumps(result | {"traces": kept}, indent=2)
+    options.output.with_suffix(".json").write_text(f"{text}\n")
     _print(result, options.output)
 
 
@@ -101,6 +107,7 @@ def _agent(run: Any) -> tuple[Any, Any]:
         algorithm=dataclasses.replace(cfg.algorithm, arguments=arguments),
     )
     env = make_eval_env(cfg, "rgb_array")
+    simplify_scene(env.envs[0])
     model = make_algorithm(cfg, env)
     load_policy(model, run / "rl_model_finished")
     return env, model
@@ -111,6 +118,9 @@ def _push_once(env: Any, model: Any, seed: int, with_frames: bool) -> dict[str, 
     inspector, script = AgentInspector(model), ScriptedPush()
     env.seed(seed)
     observations = env.reset()
+    if with_frames:
+        env.envs[0].render()  # there is no camera before
+        move_camera(env.envs[0], NEARER)
     resting = observations["observation"][0][BLOCK][2]
     variances: dict[str, list[float]] = {"executed": [], "policy": []}
     frames, fell_at = [], None
@@ -135,7 +145,7 @@ def _push_once(env: Any, model: Any, seed: int, with_frames: bool) -> dict[str, 
 def _statistics(falls: list[dict[str, Any]], attempts: int) -> dict[str, Any]:
     """Compare the mean variance before the fall with those at and after it, pair by pair."""
     result: dict[str, Any] = {"falls": len(falls), "attempts": attempts}
-    for name in ("executed", "policy"):
+    for name in ACTIONS:
         around = np.array([_around(fall, name) for fall in falls])
         before = around[:, :WINDOW].mean(axis=1)
         at, after = around[:, WINDOW], around[:, WINDOW + 1 :].mean(axis=1)
@@ -158,43 +168,49 @@ def _around(fall: dict[str, Any], name: str) -> np.ndarray:
 
 
 def _draw(falls: list[dict[str, Any]], result: dict[str, Any], path: Path) -> None:
+    """Draw three scenes of the first fall, and the variance around all falls."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     first = falls[0]
-    shown = [first["fell_at"] - WINDOW, first["fell_at"], first["fell_at"] + WINDOW]
-    figure, axes = plt.subplots(1, 4, figsize=(15, 3.8), width_ratios=[1, 1, 1, 1.5])
-    titles = (f"{WINDOW} steps before", "the block leaves the table", f"{WINDOW} steps after")
-    for axis, step, title in zip(axes, shown, titles, strict=False):
-        axis.imshow(first["frames"][step])
-        axis.set_title(title, fontsize=10)
+    offsets = (-WINDOW, 0, WINDOW)
+    figure, axes = plt.subplots(1, 4, figsize=(15, 3.8), width_ratios=[1, 1, 1, 1.6])
+    for axis, offset, letter in zip(axes, offsets, "abc", strict=False):
+        axis.imshow(first["frames"][first["fell_at"] + offset][CROP])
+        when = "the block leaves the table" if offset == 0 else f"step {offset:+d}"
+        axis.set_title(f"{letter}: {when}", fontsize=10)
         axis.axis("off")
-    steps = np.arange(-WINDOW, WINDOW + 1)
-    for name, label, color in (
-        ("policy", "for the agent's own action", "#1f5fbf"),
-        ("executed", "for the scripted action", "#c2571a"),
-    ):
-        around = np.array([_around(fall, name) for fall in falls])
-        low, middle, high = np.quantile(around, [0.25, 0.5, 0.75], axis=0)
-        axes[3].plot(steps, middle, color=color, label=label)
-        axes[3].fill_between(steps, low, high, color=color, alpha=0.2, linewidth=0)
-    axes[3].axvline(0, color="grey", linewidth=1)
-    axes[3].set_xlabel("steps from the fall")
-    title = f"critic variance, median and quartiles of {result['falls']} falls"
-    axes[3].set_title(title, fontsize=10)
-    axes[3].legend(frameon=False, fontsize=8)
-    axes[3].spines[["top", "right"]].set_visible(False)
+    _draw_traces(axes[3], falls, offsets)
+    axes[3].set_title(f"critic variance around {result['falls']} falls", fontsize=10, pad=18)
     figure.tight_layout()
     figure.savefig(path, dpi=80)
+
+
+def _draw_traces(axes: Any, falls: list[dict[str, Any]], offsets: tuple[int, ...]) -> None:
+    steps = np.arange(-WINDOW, WINDOW + 1)
+    for name, label, color in (
+        ("policy", "the agent's own action", COLORS[0]),
+        ("executed", "the scripted action", COLORS[1]),
+    ):
+        around = np.array([_around(fall, name) for fall in falls])
+        axes.plot(steps, around.T, color=color, linewidth=0.6, alpha=0.25)
+        median = np.median(around, axis=0)
+        axes.plot(steps, median, color=color, linewidth=2.4, label=f"{label}, median")
+    for offset, letter in zip(offsets, "abc", strict=True):
+        axes.axvline(offset, color="grey", linewidth=0.8, linestyle=":")
+        axes.annotate(letter, (offset, 1.02), xycoords=("data", "axes fraction"), ha="center")
+    axes.set(xlabel="steps from the fall", yscale="log")
+    axes.legend(frameon=False, fontsize=8)
+    axes.spines[["top", "right"]].set_visible(False)
 
 
 def _print(result: dict[str, Any], path: Path) -> None:
     write = sys.stdout.write
     write(f"{result['falls']} falls in {result['attempts']} pushes; picture: {path}\n")
     write("action    before    at        after     after/before  rises  p (rise, Wilcoxon)\n")
-    for name in ("executed", "policy"):
+    for name in ACTIONS:
         row = result[name]
         write(
             f"{name:<9} {row['median_before']:<9.3g} {row['median_at']:<9.3g} "

@@ -20,7 +20,7 @@ FRAME_KEY = "scilab_rl.frame"
 STATE_KEY = "scilab_rl.simulator_state"
 _OF_CONTACTS = ("efc_", "iefc_", "contact")
 CLOSE = "close"
-_NEARER = 0.58  # of the distance of a task's own camera
+NEARER = 0.58  # of the distance of a task's own camera
 _BACKGROUND = (238, 240, 244)
 
 
@@ -102,7 +102,7 @@ class FrameCapture:
             self._is_close = False
             simplify_scene(self.env)  # before graphics memory gets its textures
             self.env.render()
-            move_camera(self.env, _NEARER)
+            move_camera(self.env, NEARER)
         return self.env.render()
 
 
