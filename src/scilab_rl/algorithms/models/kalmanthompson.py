@@ -90,8 +90,10 @@ def log_largest(mean: Array, var: Array) -> Array:
         distance = (mean[0] - mean[1]) / jnp.sqrt(var.sum())
         return log_ndtr(jnp.stack([distance, -distance]))
     sd = jnp.sqrt(var)
-    draws = mean[:, None] + sd[:, None] * NODES
+    # In the precision of the beliefs: a fit computes in float64, acting in float32.
+    nodes, weights = NODES.astype(mean.dtype), WEIGHTS.astype(mean.dtype)
+    draws = mean[:, None] + sd[:, None] * nodes
     below = log_ndtr((draws[:, None] - mean[None, :, None]) / sd[None, :, None])
     others = jnp.where(jnp.eye(n, dtype=bool)[..., None], 0.0, below).sum(axis=1)
-    probabilities = (jnp.exp(others) * WEIGHTS).sum(axis=1)
+    probabilities = (jnp.exp(others) * weights).sum(axis=1)
     return jnp.log(jnp.clip(probabilities, 1e-12))

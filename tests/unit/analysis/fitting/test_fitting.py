@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from scilab_rl.algorithms.models.hybrid import HYBRID
+from scilab_rl.algorithms.models.kalmanthompson import KALMANTHOMPSON
 from scilab_rl.algorithms.models.rescorlawagner import RESCORLAWAGNER
 from scilab_rl.analysis.fitting import recovery, report
 from scilab_rl.analysis.fitting.estimation import fit, natural, prior_draws
@@ -182,6 +183,14 @@ def test_simulated_participants_are_the_same_for_the_same_seed():
         n_trials=3, env_kwargs={"horizon": 6},
     )  # fmt: skip
     assert [row["block"] for row in games] == [0] * 10 + [1] * 10 + [2] * 10
+
+
+def test_acting_and_fitting_may_take_turns():
+    """They compute in float32 and float64, in one process."""
+    true = {"observation_sd": np.full(2, 0.4), "drift_sd": np.full(2, 0.1)}
+    for _ in range(2):
+        rows = simulate(KALMANTHOMPSON, true, "Bandit-drifting-a3", n_trials=20)
+        assert fit("kalmanthompson", make_panel(rows)).converged.all()
 
 
 def test_a_recovery_is_kept_and_named(tmp_path):
