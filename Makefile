@@ -2,7 +2,7 @@
 PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
-EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim,jax,docs
+EXTRAS := dev,mlflow,wandb,tensorboard,view,box2d,metaworld,highway,coppeliasim,cognition,onnx,docs
 # Two cores learn as fast as one on small networks, but two test workers halve the waiting.
 WORKERS ?= 2
 # Which benchmarks `make bench` runs; empty: all up to an hour each.

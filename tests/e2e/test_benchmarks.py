@@ -15,6 +15,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
+from .chromium import EXECUTABLE
 from .commands import ROOT
 
 BENCHMARKS = ROOT / "benchmarks"
@@ -67,6 +68,7 @@ SMALLEST = {
     "study": (["smaller_study.py"], "unequal"),
     "decisions": (["decisions.py", "--runs", "30"], "sqlite, 30 runs"),
     "metrics": (["load.py", "metrics", "--scale", "0.01"], "part"),
+    "board": (["board.py", "--runs", "5"], "write_seconds"),
     "exported": (
         ["exported_policies.py", "--agents", "CartPole", "--observations", "100"], "agents",
     ),
@@ -98,6 +100,8 @@ def test_runs_in_its_smallest_size(name: str, tmp_path: Path, benchmarks: Any) -
     if name == "cost":
         pytest.importorskip("mlflow")
         pytest.importorskip("tensorboard")
+    if name == "board" and EXECUTABLE is None:
+        pytest.skip("needs Chromium")
     words, expected = SMALLEST[name]
     if name == "study":  # its workers are started from a file
         (tmp_path / words[0]).write_text(SMALLER_STUDY, encoding="utf-8")

@@ -1,9 +1,9 @@
 """Demonstrations for off-policy learning: where they come from, and into which ring they go.
 
 Vecerik et al., 2017, arXiv 1707.08817, and Nair et al., 2018, arXiv 1709.10089, keep demonstrations
-beside what the agent experiences, and draw a share of each batch from them. Here they lie in a ring
-of the hindsight replay buffer. They are collected once, before the first step; a checkpoint has
-them, so that a resumed run needs neither their source nor the time.
+next to what the agent experiences, and draw a share of each batch from them. Here they lie in a
+ring of the hindsight replay buffer. They are collected once, before the first step; a checkpoint
+has them, so that a resumed run needs neither their source nor the time.
 """
 
 from __future__ import annotations

@@ -206,6 +206,8 @@ def find_policy(run: RunDirectory, *names: str) -> Path:
             return policy_path(name)
         if name.removeprefix(_POLICY) in saved:
             return saved[name.removeprefix(_POLICY)]
+        if archive := saved.get(f"{name.removeprefix(_POLICY)}.zip"):
+            return archive  # of Stable-Baselines3; whoever loads it asks whether it is trusted
     if not saved:
         raise ConfigError(f"The run '{run}' has not saved a policy yet: it needs one epoch.")
     raise ConfigError(f"There is no policy '{names[0]}'. The run has: {', '.join(sorted(saved))}.")

@@ -113,7 +113,7 @@ def evaluate_side_by_side(
 ) -> list[list[Episode]]:
     """Let a policy act in several environments at once, which is faster by far.
 
-    Each environment has its own chance and its own episodes, so that which environments are beside
+    Each environment has its own chance and its own episodes, so that which environments are next to
     it changes nothing but the last bits of what networks compute for a larger batch.
 
     Args:
