@@ -5,22 +5,21 @@ from __future__ import annotations
 import http.server
 import json
 import logging
-import signal
 import sys
 import threading
 import webbrowser
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from scilab_rl.cli.parser import CommandParser, positive
+from scilab_rl.cli.serving import LOOPBACK, PageHandler, serve_until_interrupted
 from scilab_rl.errors import ConfigError
 
 if TYPE_CHECKING:  # heavy
     from scilab_rl.analysis.board import BoardReader
 
 _log = logging.getLogger(__name__)
-_HOST = "127.0.0.1"
 
 
 def main(arguments: list[str]) -> int:
@@ -60,21 +59,20 @@ class BoardServer(http.server.ThreadingHTTPServer):
 
         self.reader: BoardReader = BoardReader(base)
         self.reading = threading.Lock()
-        super().__init__((_HOST, port), partial(_Handler, directory=str(base.resolve())))
+        super().__init__((LOOPBACK, port), partial(_Handler, directory=str(base.resolve())))
 
     @property
     def address(self) -> str:
         """Where a browser finds it."""
-        return f"http://{_HOST}:{self.server_port}/"
+        return f"http://{LOOPBACK}:{self.server_port}/"
 
 
-class _Handler(http.server.SimpleHTTPRequestHandler):
+class _Handler(PageHandler):
     server: BoardServer
 
     def do_GET(self) -> None:
         """Answer with the page, its data, their version, or a file of the folder."""
-        if self._is_foreign():
-            self.send_error(403, "This page is for this machine only.")
+        if self.refuses_foreign():
             return
         answers = {"/": self._page, "/version": self._version, "/board.json": self._data}
         answer = answers.get(self.path.partition("?")[0])
@@ -83,31 +81,12 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
             return
         with self.server.reading:
             kind, text = answer()
-        body = text.encode()
-        self.send_response(200)
-        self.send_header("Content-Type", f"{kind}; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
-        self.send_header("Cache-Control", "no-store")
-        self.end_headers()
-        self.wfile.write(body)
+        self.answer(kind, text)
 
     def do_HEAD(self) -> None:
         """Answer for files, to this machine only."""
-        if self._is_foreign():
-            self.send_error(403, "This page is for this machine only.")
-        else:
+        if not self.refuses_foreign():
             super().do_HEAD()
-
-    def log_message(self, format: str, *arguments: Any) -> None:
-        """Say nothing about requests."""
-
-    def _is_foreign(self) -> bool:
-        """Return whether a page of another site asks, under a name that it lets mean our address.
-
-        See "DNS rebinding".
-        """
-        host = self.headers.get("Host", "").rpartition(":")[0]
-        return host not in (_HOST, "localhost")
 
     def _page(self) -> tuple[str, str]:
         from scilab_rl.analysis.board import render_board
@@ -123,15 +102,7 @@ class _Handler(http.server.SimpleHTTPRequestHandler):
 
 def _serve(base: Path, port: int, *, opens: bool) -> None:
     """Serve until Ctrl-C."""
-    from scilab_rl.recording.live import free_port, ssh_line
+    from scilab_rl.recording.live import free_port
 
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
     with BoardServer(base, free_port(port)) as server:
-        _log.info("Board: %s (Ctrl-C ends it)", server.address)
-        _log.info("%s", ssh_line(server.server_port))
-        if opens:
-            webbrowser.open(server.address)
-        try:
-            server.serve_forever()
-        except KeyboardInterrupt:
-            _log.info("The board is no longer served.")
+        serve_until_interrupted(server, server.address, "Board", opens=opens)

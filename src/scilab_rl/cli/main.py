@@ -35,6 +35,7 @@ COMMANDS = {
     "experiment": "train the missing runs of a comparison, then compare",
     "performance": "test whether everything still learns as well as before",
     "goals": "map where in its goal space an agent fails, and what it expects",
+    "human": "let a person play a task in a browser, and keep each choice",
     "fit": "fit cognitive models to choices and compare them",
     "recover": "simulate and fit: are parameters and models told apart?",
     "export": "write observations, actions and metrics of an agent as a table",

@@ -70,14 +70,23 @@ class FrameCapture:
         """Add the scene after a step to its info."""
         if not self._capturing:
             return
+        info[FRAME_KEY], memory = self._undisturbed_frame()
+        if memory is not None:
+            info[STATE_KEY] = memory.state
+
+    def draw(self) -> np.ndarray | str:
+        """Return a picture of the present scene, or why there is none."""
+        return self._undisturbed_frame()[0]
+
+    def _undisturbed_frame(self) -> tuple[np.ndarray | str, SimulatorMemory | None]:
         memory = simulator_memory(self.env)
-        info[FRAME_KEY] = self._frame()
+        frame = self._frame()
         if memory is not None:
             # Fetch's renderer runs the constraint solver and moves all bodies to where they are
             # now, which would change the next step in the last bits: an episode that is watched
             # must be the one that is not.
             set_simulator_memory(self.env, memory)
-            info[STATE_KEY] = memory.state
+        return frame, memory
 
     def _frame(self) -> np.ndarray | str:
         """Return a picture, or why there is none; the first reason stays, so that it is one."""

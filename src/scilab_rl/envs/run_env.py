@@ -101,6 +101,10 @@ class RunEnv(gym.Wrapper):
         """Switch capturing on, from the next reset, or off, at once."""
         self._frames.capture(on)
 
+    def draw(self) -> np.ndarray | str:
+        """Return a picture of the present scene, which changes nothing, or why there is none."""
+        return self._frames.draw()
+
     def leave_out_pictures(self, reason: str) -> None:
         """Render nothing from now on, because it cannot be done here."""
         self._frames.leave_out(reason)

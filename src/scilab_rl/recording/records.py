@@ -253,12 +253,15 @@ def title_of(panel: str) -> str:
     return f"{panel} ({_UNITS[panel]})" if panel in _UNITS else panel
 
 
-def encode_picture(frame: np.ndarray) -> bytes:
-    """Compress a frame: JPEG, or PNG for the small ones. Shapes: ``(height, width, 3)``, uint8."""
+def encode_picture(frame: np.ndarray, *, lossless: bool = False) -> bytes:
+    """Compress a frame: JPEG, or PNG if it is small or must be ``lossless``.
+
+    Shapes: ``(height, width, 3)``, uint8.
+    """
     from PIL import Image
 
     image, file = Image.fromarray(frame), io.BytesIO()
-    if max(frame.shape[:2]) <= _SMALL_SIDE:
+    if lossless or max(frame.shape[:2]) <= _SMALL_SIDE:
         image.save(file, "PNG", compress_level=1)
     else:
         image.save(file, "JPEG", quality=_JPEG_QUALITY)

@@ -112,8 +112,8 @@ def _row(
         step_metrics = asked.of_step(observation, action, reward, after, info, done, terminated)
         values = _action_values(inspector, observation, env)
     return (
-        _columns(observation, most_dimensions)
-        | _numbered("action", action)
+        observation_columns(observation, most_dimensions)
+        | numbered("action", action)
         | {"reward": reward, "return_so_far": total}
         | {curve.panel: number for curve, number in step_metrics.items()}
         | values
@@ -241,18 +241,20 @@ def _values_of_actions(
     return np.array([inspector.q_values(observation, np.int64(a)).mean() for a in actions])
 
 
-def _columns(observation: Observation, most_dimensions: int) -> Row:
+def observation_columns(observation: Observation, most_dimensions: int = MOST_DIMENSIONS) -> Row:
+    """Return an observation as columns: ``observation_0`` and so on, and of goals likewise."""
     parts = observation if isinstance(observation, dict) else {"observation": observation}
     columns: Row = {}
     for name, part in parts.items():
         flat = np.asarray(part, dtype=np.float64).ravel()
-        columns |= _numbered(name, flat[:most_dimensions])
+        columns |= numbered(name, flat[:most_dimensions])
         if len(flat) > most_dimensions:
             columns[f"{name}_norm"] = float(np.linalg.norm(flat))
     return columns
 
 
-def _numbered(name: str, value: np.ndarray) -> Row:
+def numbered(name: str, value: np.ndarray) -> Row:
+    """Return a number as one column, and an array as one for each of its numbers."""
     if np.ndim(value) == 0:
         return {name: value.item()}
     return {f"{name}_{index}": float(number) for index, number in enumerate(np.ravel(value))}
