@@ -15,6 +15,7 @@ ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "src" / "scilab_rl"
 # Import names that are not the distribution's, also where it is not installed.
 DISTRIBUTIONS = {
+    "markdown_it": "markdown-it-py",
     "PIL": "pillow", "yaml": "pyyaml", "hydra": "hydra-core", "rerun": "rerun-sdk",
     "stable_baselines3": "stable-baselines3", "zmq": "pyzmq", "highway_env": "highway-env",
 }  # fmt: skip
