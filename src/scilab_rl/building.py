@@ -20,6 +20,7 @@ from scilab_rl.learning.algorithm import Algorithm
 from scilab_rl.learning.arguments import DEMOS, INTRINSIC, accepts
 from scilab_rl.learning.compatibility import is_goal_space, is_large_image, longest_episode
 from scilab_rl.learning.replay import HindsightReplayBuffer, can_hold
+from scilab_rl.learning.values import constructor_parameters
 
 _log = logging.getLogger(__name__)
 
@@ -53,7 +54,7 @@ def build_algorithm(
     if accepts(cls, "policy") and arguments.get("policy", "auto") == "auto":
         arguments["policy"] = policy_name(env, cls)
     if "replay_buffer_class" in arguments:
-        _choose_replay_buffer(arguments, env)
+        _choose_replay_buffer(cls, arguments, env)
     if isinstance(noise := arguments.get("action_noise"), ActionNoise):
         arguments["action_noise"] = _shaped_noise(noise, env)
     given = {"env": env, "seed": seed, "device": device}
@@ -83,7 +84,9 @@ def policy_name(env: VecEnv, cls: object) -> str:
     return recurrent if recurrent in getattr(cls, "policy_aliases", ()) else f"{kind}Policy"
 
 
-def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:
+def _choose_replay_buffer(
+    cls: Callable[..., Algorithm], arguments: dict[str, Any], env: VecEnv
+) -> None:
     chosen, has_goals = arguments["replay_buffer_class"], is_goal_space(env.observation_space)
     if chosen == "auto":
         ours = HindsightReplayBuffer if can_hold(env.observation_space) else HerReplayBuffer
@@ -99,7 +102,7 @@ def _choose_replay_buffer(arguments: dict[str, Any], env: VecEnv) -> None:
             "Hindsight experience replay needs an environment with goals (Dict observations with "
             "observation, achieved_goal, desired_goal); add ++algorithm.replay_buffer_class=null."
         )
-    arguments["learning_starts"] = _first_update(arguments, env)
+    arguments["learning_starts"] = _first_update(cls, arguments, env)
 
 
 def _intrinsic_reward_buffer(arguments: dict[str, Any], env: VecEnv) -> type[ReplayBuffer]:
@@ -114,7 +117,7 @@ def _intrinsic_reward_buffer(arguments: dict[str, Any], env: VecEnv) -> type[Rep
     return with_intrinsic_reward(arguments.get("replay_buffer_class") or plain)
 
 
-def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
+def _first_update(cls: Callable[..., Algorithm], arguments: Mapping[str, Any], env: VecEnv) -> int:
     """Return ``learning_starts``, late enough for one whole episode to have been stored."""
     longest = longest_episode(env)
     if longest is None:
@@ -122,10 +125,13 @@ def _first_update(arguments: dict[str, Any], env: VecEnv) -> int:
             "Hindsight experience replay needs a step limit, and this environment has none; add "
             "+env_kwargs.max_episode_steps=N or ++algorithm.replay_buffer_class=null."
         )
-    wanted = int(arguments.get("learning_starts", 100))
+    default = constructor_parameters(cls)["learning_starts"].default
+    wanted = int(arguments.get("learning_starts", default))
     needed = longest * env.num_envs + env.num_envs
     if wanted < needed:
-        _log.info(
+        # Nobody asked for the default; who chose another value is told.
+        _log.log(
+            logging.DEBUG if wanted == default else logging.INFO,
             "learning_starts raised from %d to %d: hindsight replay needs one whole episode first.",
             wanted,
             needed,

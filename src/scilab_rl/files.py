@@ -159,6 +159,12 @@ def point_to(link: Path, target: Path) -> None:
         temporary.unlink(missing_ok=True)
 
 
+def shown(path: Path) -> str:
+    """Return a path as people type it: from the working directory where it is below it."""
+    here, path = Path.cwd(), path.absolute()
+    return str(path.relative_to(here) if path.is_relative_to(here) else path)
+
+
 def sha256(path: Path) -> str:
     """Return the hexadecimal SHA-256 of a file."""
     with path.open("rb") as file:

@@ -108,3 +108,10 @@ def test_the_checksum_is_that_of_the_whole_file(tmp_path):
     content = os.urandom(3 * 2**20 + 17)
     (tmp_path / "a").write_bytes(content)
     assert files.sha256(tmp_path / "a") == hashlib.sha256(content).hexdigest()
+
+
+def test_a_path_is_shown_from_here_where_it_is_below(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert files.shown(tmp_path / "data" / "run") == "data/run"
+    assert files.shown(Path("data/run")) == "data/run"
+    assert files.shown(tmp_path.parent / "other") == str(tmp_path.parent / "other")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -21,6 +20,7 @@ from scilab_rl.config.compose import (
 from scilab_rl.config.schema import RunConfig, flatten
 from scilab_rl.config.workspace import SHIPPED_CONF, config_files, open_project, tuned_option
 from scilab_rl.errors import ConfigError, did_you_mean
+from scilab_rl.files import shown
 
 _LAYER_NAMES = {"tuned_values": "tuned values", "performance": "experiment"}
 _COLUMNS = ("key", "value", "state", "layer", "source")
@@ -147,7 +147,7 @@ def _file_layers(overrides: Sequence[str]) -> Iterator[Layer]:
         path = config_files(group)[option] if option else SHIPPED_CONF / f"{group}.yaml"
         path_of_keys = part.package.split(".") if part.package else []
         values = _nested(path_of_keys, read_yaml(path))
-        yield Layer(_LAYER_NAMES.get(group, group), _near(path), values)
+        yield Layer(_LAYER_NAMES.get(group, group), shown(path), values)
 
 
 def _typed_layers(overrides: Sequence[str]) -> Iterator[Layer]:
@@ -164,11 +164,3 @@ def _nested(path: Sequence[str], values: Mapping[str, object]) -> Mapping[str, o
     for part in reversed(path):
         values = {part: values}
     return values
-
-
-def _near(path: Path) -> str:
-    """Return a path relative to the working directory if it is inside it."""
-    resolved = path.resolve()
-    return str(
-        resolved.relative_to(Path.cwd()) if resolved.is_relative_to(Path.cwd()) else resolved
-    )

@@ -15,6 +15,7 @@ from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.schema import RunConfig
 from scilab_rl.config.workspace import open_project
 from scilab_rl.errors import ConfigError
+from scilab_rl.files import shown
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, all_agents, find_policy, find_run
 
 if TYPE_CHECKING:  # heavy
@@ -127,6 +128,6 @@ def _report(summary: EvaluationSummary, cfg: RunConfig) -> None:
         ("return", f"{returns.mean():.3g} (from {returns.min():.3g} to {returns.max():.3g})")
     )
     if summary.replay is not None and summary.replay.video.is_file():
-        rows.append(("video", str(summary.replay.video)))
+        rows.append(("video", shown(summary.replay.video)))
     sys.stdout.flush()
     print_table(rows)

@@ -8,6 +8,7 @@ import logging
 from scilab_rl.cli.parser import CommandParser
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.workspace import open_project
+from scilab_rl.files import shown
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run
 from scilab_rl.run.provenance import fingerprint_differences
 from scilab_rl.run.recordings import chosen_recordings
@@ -47,7 +48,7 @@ def main(arguments: list[str]) -> int:
             render_clip_files(probed)
         except RuntimeError as error:
             _log.warning("%s: %s", probed.name, error)
-        _log.info("%s", probed.with_suffix(".html"))
+        _log.info("%s", shown(probed.with_suffix(".html")))
     return 0
 
 

@@ -16,6 +16,7 @@ from typing import BinaryIO
 
 from scilab_rl.cli.parser import CommandParser
 from scilab_rl.errors import ConfigError
+from scilab_rl.files import shown
 from scilab_rl.recording.live import (
     LOOPBACK,
     PAGE_PORT,
@@ -53,7 +54,7 @@ def show(recording: Path, *, in_browser: bool) -> None:
         if reason is None:
             return
         _log.warning("No window can be opened (%s). The page shows it too:", reason)
-    _log.info("%s", page)
+    _log.info("%s", shown(page))
     if not page.is_file():
         raise ConfigError(f"'{page}' does not exist. `scilab-rl probe` makes it again.")
     if has_display() and webbrowser.open(page.resolve().as_uri()):

@@ -14,6 +14,7 @@ from scilab_rl.cli.view import chosen_recordings
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.workspace import open_project
 from scilab_rl.errors import ConfigError
+from scilab_rl.files import shown
 from scilab_rl.recording.records import FOLDER as EPISODES
 from scilab_rl.recording.records import SUFFIX
 from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run, slug
@@ -48,7 +49,7 @@ def main(arguments: list[str]) -> int:
     page = run.outputs / FOLDER / f"{recording.stem}_{_name(options)}.html"
     write_report(report, page)
     _log.info("%s", verdict(report))
-    _log.info("%s", page)
+    _log.info("%s", shown(page))
     return 0
 
 

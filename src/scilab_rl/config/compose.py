@@ -23,6 +23,7 @@ from scilab_rl.config.overrides import as_text, as_texts, tuple_as_list
 from scilab_rl.config.schema import ALIASES, KEYS, STRING, RunConfig, Values, unknown_key
 from scilab_rl.config.workspace import SHIPPED_CONF, config_files, tuned_option
 from scilab_rl.errors import ConfigError, did_you_mean, listing
+from scilab_rl.files import shown
 
 _log = logging.getLogger(__name__)
 # Keys whose values are text, which Hydra may need in quotes; commas in prose separate no values.
@@ -62,7 +63,7 @@ def compose_values(overrides: Sequence[str], composed: DictConfig | None = None)
         logging.DEBUG if path.is_relative_to(SHIPPED_CONF) else logging.INFO,
         "Tuned values for %s are used: %s (off with tuned=false).",
         tuned.replace("/", " with "),
-        _near(path),
+        shown(path),
     )
     return _plain([f"+tuned_values={tuned}", *overrides])
 
@@ -154,11 +155,6 @@ def _readable(name: str, value: str) -> str:
     if name in _TEXTS:
         return as_text(value, may_sweep=name not in _PROSE)
     return value
-
-
-def _near(path: Path) -> Path:
-    """Return a path as seen from here when it is below here."""
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
 
 
 def explain_error(error: Exception) -> ConfigError:

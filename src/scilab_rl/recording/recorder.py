@@ -17,6 +17,7 @@ import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
+from scilab_rl.files import shown
 from scilab_rl.recording.movie import write_movie
 from scilab_rl.recording.records import SUFFIX, Clip, ClipInfo, Record, load_clip, save_clip
 from scilab_rl.recording.replay import write_index, write_replay
@@ -75,7 +76,7 @@ class ClipRecorder:
             self._finished.put(None)
             self._thread.join()
             self._thread = None
-            n, run = len(self.recordings), self.folder.parent
+            n, run = len(self.recordings), shown(self.folder.parent)
             _log.info("Recorded episodes: %d. View them with: scilab-rl view %s", n, run)
 
     def _work(self) -> None:
