@@ -330,6 +330,7 @@ class Agent:
         per: Literal["step", "episode"] = "step",
         seed: int | None = None,
         softmax: float | None = None,
+        sample: bool = False,
         dimensions: int = 12,
     ) -> list[dict[str, float]]:
         """Let the agent act and return what it saw, did, got and thought.
@@ -340,6 +341,7 @@ class Agent:
             seed: Of the episodes; None means the run's seed plus 1.
             softmax: Choose with probability proportional to exp(softmax Q), as a simulated
                 participant; None means the most likely action.
+            sample: Whether actions are drawn from the policy. Those of cognitive models always are.
             dimensions: So many numbers of each part of an observation.
 
         Returns:
@@ -350,8 +352,15 @@ class Agent:
         seed = int(self.cfg.seed) + 1 if seed is None else seed
         prepare_torch(self.cfg)
         choose = None if softmax is None else softmax_choice(self.algorithm, softmax, seed)
+        seed_everything(seed)
         rows = collect(
-            self.algorithm, self.env, episodes, seed, choose=choose, most_dimensions=dimensions
+            self.algorithm,
+            self.env,
+            episodes,
+            seed,
+            choose=choose,
+            sampled=sample or getattr(self.algorithm, "chooses_by_chance", False),
+            most_dimensions=dimensions,
         )
         return by_episode(rows) if per == "episode" else rows
 

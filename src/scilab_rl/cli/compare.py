@@ -1,4 +1,7 @@
-"""``scilab-rl compare A B ...``: which group of runs learns better, and how sure is that?"""
+"""``scilab-rl compare A B ...``: which group of runs learns better, and how sure is that?
+
+With tables of choices or models among the groups, behavior is compared: see `compare_behavior`.
+"""
 
 from __future__ import annotations
 
@@ -9,6 +12,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from scilab_rl.analysis.fitting.words import names_choices
+from scilab_rl.cli import compare_behavior
 from scilab_rl.cli.parser import CommandParser
 from scilab_rl.cli.tables import print_json, print_rows, write
 from scilab_rl.errors import ConfigError
@@ -24,6 +29,9 @@ FOLDER = "comparisons"
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     options = _parse(arguments)
+    if any(map(names_choices, options.groups)):
+        compare_behavior.show_behavior(options)
+        return 0
     from scilab_rl.analysis.groups import find_group, read_records
 
     if len(options.groups) < 2:
@@ -104,13 +112,19 @@ def _only(group: Group, env: str) -> Group:
 
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = CommandParser(
-        "compare", "Compare runs, studies, algorithms or groups of runs.", base=True, json=True
+        "compare",
+        "Compare runs, studies, algorithms or groups of runs; or, with a table of choices or a "
+        "model among them, what people, models and agents do in a choice task.",
+        base=True,
+        json=True,
     )
     parser.add_argument(
         "groups",
         nargs="+",
         metavar="GROUP",
-        help="a run, study, group, algorithm, tag, or pattern as '*-sac-*'; LABEL=GROUP names it",
+        help="a run, study, group, algorithm, tag, or pattern as '*-sac-*'; choices.csv or "
+        "model:NAME (with env_kwargs.KEY=VALUE); LABEL=GROUP names it",
     )
     add_options(parser)
+    compare_behavior.add_options(parser)
     return parser.parse_args(arguments)

@@ -122,6 +122,7 @@ def _trials(
             per=options.per,
             seed=options.seed or None,
             softmax=options.softmax,
+            sample=options.sample,
             dimensions=options.dimensions,
         )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import logging
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +66,21 @@ class Panel:
     def n_choices(self) -> np.ndarray:
         """Free choices per participant. Shapes: ``(n_participants,)``."""
         return self.counts.sum(axis=1)
+
+    def has(self, name: str) -> bool:
+        """Return whether the table has a column."""
+        return name in self.rows[0][0]
+
+    def column(self, name: str) -> np.ndarray:
+        """Return a column of numbers; NaN where there is none.
+
+        Shapes:
+            result: ``(n_participants, n_choices)``.
+        """
+        table = np.full(self.responses.shape, np.nan)
+        for index, rows in enumerate(self.rows):
+            table[index, : len(rows)] = [_number(row, name, math.nan, "the table") for row in rows]
+        return table
 
 
 def read_panel(path: Path) -> Panel:

@@ -11,13 +11,17 @@ from typing import Any
 import numpy as np
 
 from scilab_rl.analysis.fitting import recovery as recoveries
+from scilab_rl.analysis.fitting.behavior import curve_charts, interval_rows
 from scilab_rl.analysis.fitting.estimation import MAP, Fit, fit
 from scilab_rl.analysis.fitting.panel import Panel
 from scilab_rl.analysis.fitting.predictive import (
     Behavior,
-    learning_curve,
+    Curve,
     simulated_panel,
+    size_of,
     stay_probabilities,
+    task_behavior,
+    task_curves,
 )
 from scilab_rl.analysis.fitting.recovery import Recovery
 from scilab_rl.analysis.fitting.selection import (
@@ -28,7 +32,7 @@ from scilab_rl.analysis.fitting.selection import (
     select,
 )
 from scilab_rl.analysis.report import write_table
-from scilab_rl.charts import Interval, Series
+from scilab_rl.charts import Series
 from scilab_rl.files import write_text
 from scilab_rl.pages import render
 
@@ -55,7 +59,7 @@ class FitResults:
         held_out: Predictions of left-out choices, one per model.
         selection: Random-effects comparison; None with a single model or without evidence.
         behavior: What was done, and what each model does: condition to shares per participant.
-        curves: Learning curves in the same order; empty without a known task.
+        curves: How that changes, in the same order; only of the data without a known task.
         simulated: Whether the models' behavior is simulated, or expected given the actual trials.
         posteriors: Hierarchical samples, one per model, if requested.
         recovery: Sentences about the recovery of the models.
@@ -66,7 +70,7 @@ class FitResults:
     held_out: list[HeldOut]
     selection: Selection | None
     behavior: dict[str, Behavior]
-    curves: dict[str, tuple[np.ndarray, np.ndarray]]
+    curves: dict[str, list[Curve]]
     simulated: bool
     posteriors: list[Any] = field(default_factory=list)
     recovery: list[str] = field(default_factory=list)
@@ -134,24 +138,22 @@ def _score(fitted: Fit) -> np.ndarray:
 
 def _behavior(
     panel: Panel, fits: Sequence[Fit], env: str, env_kwargs: Mapping[str, Any], seed: int
-) -> tuple[dict[str, Behavior], dict[str, tuple[np.ndarray, np.ndarray]], bool]:
-    behavior = {_PEOPLE: stay_probabilities(panel)}
-    curves = {_PEOPLE: learning_curve(panel)}
+) -> tuple[dict[str, Behavior], dict[str, list[Curve]], bool]:
+    curves = {_PEOPLE: task_curves(panel)}
     if env:
-        blocks = {row.get("block") for row in panel.rows[0]}
-        n_trials = panel.seen.is_first.shape[1] // panel.n_stages
-        if len(blocks) > 1:
-            n_trials = len(blocks) if env.startswith("Horizon") else n_trials // len(blocks)
+        behavior = {_PEOPLE: task_behavior(panel)}
         for fitted in fits:
-            acted = simulated_panel(fitted, env, n_trials, env_kwargs, seed)
-            behavior[fitted.name] = stay_probabilities(acted)
-            curves[fitted.name] = learning_curve(acted)
+            acted = simulated_panel(
+                fitted.model, fitted.values, size_of(panel), env, env_kwargs, seed
+            )
+            behavior[fitted.name] = task_behavior(acted)
+            curves[fitted.name] = task_curves(acted)
     else:
+        behavior = {_PEOPLE: stay_probabilities(panel)}
         for fitted in fits:
             expected = choice_probabilities(fitted.model, panel, fitted.values)
             behavior[fitted.name] = stay_probabilities(panel, expected)
-    known = {name: curve for name, curve in curves.items() if curve is not None}
-    return behavior, known, bool(env)
+    return behavior, curves, bool(env)
 
 
 def model_rows(results: FitResults) -> list[dict[str, object]]:
@@ -270,8 +272,9 @@ def fit_page(results: FitResults, title: str) -> str:
         models_caption="Smaller AIC and BIC, and larger probabilities of held-out choices, are "
         "better. Frequency: estimated share of participants with the model. PXP: protected "
         "exceedance probability, that it is the most frequent one (Rigoux et al., 2014).",
-        forests=_forests(results, kind),
-        curves=_curves(results),
+        choices=interval_rows(results.behavior),
+        choices_caption=f"Means over participants with 95 % intervals; {kind}.",
+        curves=curve_charts(results.curves),
         groups=_table(GROUP_COLUMNS, group_rows(results)),
         quality=_quality(results),
         recovery=results.recovery,
@@ -286,35 +289,6 @@ def _quality(results: FitResults) -> str:
         for p in results.posteriors
     ]
     return " ".join(lines)
-
-
-def _forests(results: FitResults, kind: str) -> list[tuple[Any, ...]]:
-    """Return the charts of repeated choices: title, rows, label, range and caption."""
-    rows = [
-        Interval(f"{condition}: {name}", *_mean_interval(behavior[condition]), color=color)
-        for condition in results.behavior[_PEOPLE]
-        for color, (name, behavior) in enumerate(results.behavior.items())
-    ]
-    caption = f"Means over participants with 95 % intervals; {kind}."
-    return [("Repeated choices", rows, "probability of the same response", (0, 1), caption)]
-
-
-def _mean_interval(values: np.ndarray) -> tuple[float, float, float]:
-    known = values[np.isfinite(values)]
-    if not len(known):
-        return 0.0, 0.0, 0.0
-    error = 1.96 * known.std(ddof=1) / np.sqrt(len(known)) if len(known) > 1 else 0.0
-    return float(known.mean()), float(known.mean() - error), float(known.mean() + error)
-
-
-def _curves(results: FitResults) -> list[Series]:
-    series = []
-    for color, (name, (trials, shares)) in enumerate(results.curves.items()):
-        ends = [_mean_interval(shares[:, place]) for place in range(len(trials))]
-        mean, low, high = (list(numbers) for numbers in zip(*ends, strict=True))
-        xs = trials.tolist()
-        series.append(Series(name, mean=(xs, mean), band=(xs, low, high), color=color))
-    return series if len(series) > 1 else []
 
 
 def write_fit(results: FitResults, folder: Path, title: str, *, parquet: bool = False) -> Path:

@@ -35,8 +35,12 @@ def make_task(env: str, env_kwargs: Mapping[str, Any]) -> ChoiceTask:
     return task
 
 
-def length_of(env: str, n_trials: int, env_kwargs: Mapping[str, Any]) -> tuple[dict[str, Any], int]:
+def length_of(
+    env: str, n_trials: int | None, env_kwargs: Mapping[str, Any]
+) -> tuple[dict[str, Any], int]:
     """Return arguments of a task and blocks that make so many trials; games where it has games."""
+    if n_trials is None:
+        return dict(env_kwargs), 1
     task = make_task(env, env_kwargs)
     if "n_trials" in inspect.signature(type(task).__init__).parameters:
         return {**env_kwargs, "n_trials": n_trials}, 1
@@ -48,7 +52,8 @@ def simulate(
     parameters: Mapping[str, np.ndarray],
     env: str,
     *,
-    n_trials: int,
+    n_trials: int | None,
+    n_blocks: int | None = None,
     env_kwargs: Mapping[str, Any] | None = None,
     seed: int = 0,
 ) -> list[Row]:
@@ -58,14 +63,17 @@ def simulate(
         model: The model that they all have.
         parameters: By name; one value per participant.
         env: Id of a choice task.
-        n_trials: Trials of each participant, in one block; games, in a task of games.
+        n_trials: Trials of each participant, in one block; games, in a task of games; None: as many
+            as the task has.
+        n_blocks: Several blocks, or games, of so many trials; None: as above.
         env_kwargs: Further arguments of the task.
         seed: Of tasks and choices.
 
     Shapes:
         parameters: ``(n_participants,)`` each.
     """
-    arguments, n_blocks = length_of(env, n_trials, env_kwargs or {})
+    arguments, n_default = length_of(env, n_trials, env_kwargs or {})
+    n_blocks = n_blocks or n_default
     n = len(next(iter(parameters.values())))
     tasks = [make_task(env, arguments) for _ in range(n)]
     space = tasks[0].observation_space
@@ -95,7 +103,9 @@ def simulate(
                 blocks[index] += 1
                 now[index] = task.reset()[0]
     return [
-        {"participant_id": f"p{index:03d}", **row} for index, own in enumerate(rows) for row in own
+        {"participant_id": f"p{index:03d}", "env": env, **row}
+        for index, own in enumerate(rows)
+        for row in own
     ]
 
 

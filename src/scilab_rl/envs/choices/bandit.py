@@ -88,6 +88,8 @@ class Bandit(ChoiceTask):
         columns = {"feedback": float(self.outcomes[self.row, response])}
         columns["correct"] = int(means[response] >= means.max())
         columns |= {f"mean_{arm}": float(mean) for arm, mean in enumerate(means)}
+        if self.schedule == "reversal":
+            columns["reversals"] = self.row // self.reversal_every
         self.trial += 1
         return columns
 

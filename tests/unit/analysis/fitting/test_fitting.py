@@ -169,8 +169,8 @@ def test_planners_change_after_a_rare_reward():
 def test_a_learning_curve_counts_correct_choices():
     rows = rows_of((0, 1), (0, 1), forced=0)
     rows = [row | {"trial": index, "correct": index} for index, row in enumerate(rows)]
-    trials, shares = learning_curve(make_panel(rows))
-    assert trials.tolist() == [0.5, 1.5] and shares.tolist() == [[0.0, 1.0]]
+    curve = learning_curve(make_panel(rows))
+    assert curve.places.tolist() == [0.5, 1.5] and curve.shares.tolist() == [[0.0, 1.0]]
     assert learning_curve(make_panel(rows_of((0, 1)))) is None
 
 
@@ -214,7 +214,7 @@ def test_the_page_says_what_follows(tmp_path, learners, fits):
     )
     assert "rescorlawagner is the most frequent model of 8" in report.conclusions(results)[0]
     page = report.write_fit(results, tmp_path / "fit", "People")
-    assert "Repeated choices" in page.read_text() and "<script" not in page.read_text()
+    assert "Reversals" in page.read_text() and "<script" not in page.read_text()
     with (tmp_path / "fit" / "participants.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == 8 * 3 and rows[0]["participant_id"] == "p000"
