@@ -7,10 +7,12 @@ minutes); else they are drawn from docs/figures/curves.json.
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import matplotlib
 
@@ -155,6 +157,49 @@ def figure_seeds() -> None:
     save(figure, "seeds")
 
 
+def figure_pictures() -> None:
+    """What `GoalEnv` draws of one, two and three numbers, and the example of the page."""
+    page = (IMAGES.parent / "howto" / "draw_environment.md").read_text(encoding="utf-8")
+    example = re.search(r"```python title=\"src/custom_envs/open_field.py\"\n(.*?)```", page, re.S)
+    assert example is not None
+    names: dict[str, Any] = {}
+    exec(example[1], names)
+    figure, axes = plt.subplots(2, 2, figsize=(7, 7.3), layout="constrained")
+    tasks = [Wander(1), Wander(2), Wander(3), names["OpenField"](render_mode="rgb_array")]
+    titles = ["one number", "two numbers", "three numbers", "drawn by render()"]
+    for axis, task, title in zip(axes.flat, tasks, titles, strict=True):
+        task.reset(seed=3)
+        direction = np.sign(task.goal - task.achieved_goal())
+        for step in range(9):  # towards the goal, on a detour
+            task.step(
+                (direction * np.roll((0.9, 0.1, 0.5), step // 3)[: len(direction)]).astype(
+                    np.float32
+                )
+            )
+        axis.imshow(task.render())
+        axis.set_title(title, fontsize=11)
+        axis.axis("off")
+    save(figure, "pictures")
+
+
+class Wander(MyTask):
+    """The template's task with any number of dimensions."""
+
+    def __init__(self, size: int) -> None:
+        self.action_size = size
+        super().__init__(render_mode="rgb_array")
+
+    def reset_state(self) -> None:
+        """Begin in the middle."""
+        self.place = np.zeros(self.action_size)
+
+    def sample_goal(self) -> np.ndarray:
+        """Draw a place that is some steps away."""
+        return self.np_random.choice([-1, 1], self.action_size) * self.np_random.uniform(
+            0.4, 0.9, self.action_size
+        )
+
+
 def train_curves() -> None:
     """Train with and without hindsight, and keep the success rates."""
     gym.register(ENV, MyTask, max_episode_steps=30)
@@ -193,7 +238,7 @@ def save(figure: plt.Figure, name: str) -> None:
 
 FIGURES: tuple[Callable[[], None], ...] = (
     figure_gamma, figure_interval, figure_disagreement, figure_her, figure_her_learning,
-    figure_seeds,
+    figure_seeds, figure_pictures,
 )  # fmt: skip
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import logging
 import os
@@ -96,8 +97,11 @@ def check_task(overrides: Sequence[str], n_steps: int) -> Iterator[CheckResult]:
     from scilab_rl.config.workspace import open_project
     from scilab_rl.envs import checker, fingerprint
     from scilab_rl.envs.vectorize import make_single_env
+    from scilab_rl.recording.gl import choose_backend
     from scilab_rl.run.checks import complete
 
+    with contextlib.suppress(RenderingError):  # the check of pictures says it
+        choose_backend()  # before the environment imports MuJoCo
     open_project()
     cfg = complete(compose(["tuned=false", *overrides]))
     known = () if cfg.env_kwargs or cfg.wrappers else fingerprint.known(cfg.env)
@@ -106,6 +110,7 @@ def check_task(overrides: Sequence[str], n_steps: int) -> Iterator[CheckResult]:
         lambda: make_single_env(cfg),
         n_steps=n_steps,
         known_fingerprints=known,
+        make_drawn=lambda: make_single_env(cfg, "rgb_array"),
     )
 
 

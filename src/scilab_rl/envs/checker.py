@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import pickle
+import time
 import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -48,12 +49,14 @@ class CheckContext:
         env: With its step limit.
         rollout: A random policy's steps in it.
         known_fingerprints: Fingerprints that it is known to have.
+        make_drawn: Makes one that can be drawn; None: pictures are not checked.
     """
 
     make: Callable[[], gym.Env]
     env: gym.Env
     rollout: RandomRollout
     known_fingerprints: tuple[str, ...] = ()
+    make_drawn: Callable[[], RunEnv] | None = None
 
     @property
     def has_goals(self) -> bool:
@@ -77,7 +80,11 @@ class CheckContext:
 
 
 def check_environment(
-    make: Callable[[], gym.Env], *, n_steps: int = 1000, known_fingerprints: Iterable[str] = ()
+    make: Callable[[], gym.Env],
+    *,
+    n_steps: int = 1000,
+    known_fingerprints: Iterable[str] = (),
+    make_drawn: Callable[[], RunEnv] | None = None,
 ) -> Iterator[CheckResult]:
     """Yield what is found, check by check; a check that itself breaks is a finding too.
 
@@ -85,6 +92,7 @@ def check_environment(
         make: Makes the environment, as ``gymnasium.make`` does.
         n_steps: Random steps on which rewards and endings are compared.
         known_fingerprints: Those that the environment may have.
+        make_drawn: Makes one with ``render_mode="rgb_array"``; None: pictures are not checked.
     """
     env = guard(make())
     try:
@@ -94,7 +102,7 @@ def check_environment(
             "random steps", FAIL, f"{type(error).__name__}: {error}", "repair step/reset"
         )
         return
-    context = CheckContext(make, env, rollout, tuple(known_fingerprints))
+    context = CheckContext(make, env, rollout, tuple(known_fingerprints), make_drawn)
     for check in CHECKS if context.has_goals else PLAIN_CHECKS:
         try:
             yield from check(context)
@@ -353,6 +361,31 @@ def check_stability(context: CheckContext) -> Iterator[CheckResult]:
         yield CheckResult("stability", OK, "no numerical warning")
 
 
+def check_pictures(context: CheckContext) -> Iterator[CheckResult]:
+    """Check that drawing a scene does not change what follows."""
+    if context.make_drawn is None:
+        return
+    env, other = context.make_drawn(), context.make_drawn()
+    env.reset(seed=_SEED)
+    start = time.perf_counter()
+    picture = env.draw()
+    seconds = time.perf_counter() - start
+    if isinstance(picture, str):
+        yield CheckResult("pictures", INFO, f"none: {picture}")
+    elif all(  # the second episode is drawn from what the first one has left
+        equal(course(env, seed, after_step=env.draw), course(other, seed)) for seed in (_SEED, None)
+    ):
+        height, width, _ = picture.shape
+        found = f"{width} x {height} pixels, the first in {1e3 * seconds:.0f} ms"
+        yield CheckResult("pictures", OK, f"{found}; drawing changes no step")
+    else:
+        found = "an episode that is drawn is another one"
+        fix = "render() must neither change the state nor use self.np_random"
+        yield CheckResult("pictures", FAIL, found, fix)
+    env.close()
+    other.close()
+
+
 def check_fingerprint(context: CheckContext) -> Iterator[CheckResult]:
     """Tell the fingerprint, and whether it is a known one."""
     env = context.make()
@@ -377,6 +410,7 @@ PLAIN_CHECKS: tuple[Callable[[CheckContext], Iterator[CheckResult]], ...] = (
     check_difficulty,
     check_stability,
     check_speed,
+    check_pictures,
     check_fingerprint,
 )
 CHECKS = (
@@ -390,7 +424,9 @@ CHECKS = (
 )
 
 
-def course(env: gym.Env, seed: int, n_steps: int = 20) -> list[object]:
+def course(
+    env: gym.Env, seed: int | None, n_steps: int = 20, *, after_step: Callable[[], object] = bool
+) -> list[object]:
     """Return the observations and rewards of an episode; its actions are always the same."""
     rng = np.random.default_rng(_SEED)
     observed: list[object] = [env.reset(seed=seed)[0]]
@@ -399,6 +435,7 @@ def course(env: gym.Env, seed: int, n_steps: int = 20) -> list[object]:
             scripted_action(env.action_space, rng)
         )
         observed.append((observation, reward))
+        after_step()
         if terminated or truncated:
             break
     return observed

@@ -11,6 +11,7 @@ from gymnasium.wrappers import TimeLimit
 
 from scilab_rl.envs.checker import check_environment
 from scilab_rl.envs.goal import GoalEnv
+from scilab_rl.envs.run_env import RunEnv
 
 
 class Sound(GoalEnv):
@@ -122,15 +123,26 @@ class Breaks(Sound):
         raise RuntimeError("motor off")
 
 
+class RandomPicture(Sound):
+    def render(self) -> np.ndarray:
+        return self.np_random.integers(0, 255, (8, 8, 3)).astype(np.uint8)
+
+
+class NoPicture(Sound):
+    def render(self) -> None:
+        return None
+
+
 def diagnose(cls: type, *arguments) -> dict[str, Any]:
-    found = check_environment(lambda: TimeLimit(cls(*arguments), 20), n_steps=300)
+    make = lambda: TimeLimit(cls(*arguments), 20)  # noqa: E731
+    found = check_environment(make, n_steps=300, make_drawn=lambda: RunEnv(make()))
     return {finding.check: finding for finding in found}
 
 
 def test_a_sound_environment_is_found_sound() -> None:
     found = diagnose(Sound)
     assert {finding.result for finding in found.values()} == {"ok", "info"}
-    assert len(found) == 16
+    assert len(found) == 17
     assert found["success of random actions"].found.endswith("of 15 episodes")
 
 
@@ -149,6 +161,7 @@ def test_a_sound_environment_is_found_sound() -> None:
         (EndsAlone, "endings of relabeled goals", "fail", "compute_terminated differs"),
         (AlreadyThere, "trivial goals", "warn", "100% of"),
         (WrongShape, "goals", "fail", "300 observations are outside"),
+        (RandomPicture, "pictures", "fail", "an episode that is drawn is another one"),
         (Breaks, "random steps", "fail", "RuntimeError: motor off"),
     ],
 )
@@ -157,6 +170,11 @@ def test_each_fault_is_found(cls, check, result, words) -> None:
     assert finding.result == result, finding
     assert words in finding.found
     assert finding.fix
+
+
+def test_what_cannot_be_drawn_is_told() -> None:
+    finding = diagnose(NoPicture)["pictures"]
+    assert (finding.result, finding.found) == ("info", "none: render() returned None")
 
 
 def test_lost_arguments_are_found() -> None:
