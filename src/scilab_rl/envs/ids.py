@@ -1,20 +1,22 @@
 """The environments of Scilab-RL, and the long ids that name their variants.
 
 The variants of a maze are not thousands of registered ids: the name is read, and this one variant
-is registered on request. Variants that are few, such as ``Blocks-o2-gripper_above-v1``, are
-registered from the beginning, so that ``gymnasium.make`` knows them.
+is registered on request, also that of ``gymnasium.make``. Variants that are few, such as
+``Blocks-o2-gripper_above-v1``, are registered from the beginning, so that lists have them.
 """
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 from gymnasium.envs import registration
+from gymnasium.envs.registration import EnvSpec
 
-from scilab_rl.errors import ConfigError
+from scilab_rl.errors import ConfigError, nearest_word
 
 Arguments: TypeAlias = dict[str, Any]
 _VERSION = r"(?:-v\d+)?"
@@ -32,7 +34,7 @@ class Family:
         pattern: The same as a regular expression; its groups are keyword arguments.
         read: Turns the groups into keyword arguments and, under ``max_episode_steps``, the limit.
         variants: Names of the variants, without version, where they are few: those are registered
-            from the beginning, for ``gymnasium.make``.
+            from the beginning, for Gymnasium's lists.
     """
 
     env_id: str
@@ -93,17 +95,18 @@ def _read_bandit(groups: Mapping[str, str]) -> Arguments:
 
 
 _MAPS = ("open", "open_dg", "open_dgr", "small_open_dg", "small_open_dgr", "medium_custom_dgr")
-_REWARD = r"-(?P<reward_type>sparse|sparseneg|dense)"
+_REWARDS = ("sparse", "sparseneg", "dense")
+_REWARD = rf"-(?P<reward_type>{'|'.join(_REWARDS)})"
 _PLACE = (
     r"-(?P<threshold>\d+(?:\.\d*)?|\.\d+)"
     rf"-(?P<maze_map>{'|'.join(_MAPS)})"
     r"-c(?P<continuing>[01])-rt(?P<reset_target>[01])-s(?P<max_episode_steps>[1-9]\d*)"
 )
 _PLACE_GRAMMAR = f"THRESHOLD-MAP-c{{0,1}}-rt{{0,1}}-sSTEPS-v0, MAP one of {', '.join(_MAPS)}"
-_REWARD_GRAMMAR = "{sparse,sparseneg,dense}"
-_BLOCKS = tuple(
-    f"Blocks-o{n}-gripper_{goal}" for n in range(1, 5) for goal in ("none", "random", "above")
-)
+_REWARD_GRAMMAR = f"{{{','.join(_REWARDS)}}}"
+_GRIPPERS = ("gripper_none", "gripper_random", "gripper_above")
+_BLOCKS = tuple(f"Blocks-o{n}-{goal}" for n in range(1, 5) for goal in _GRIPPERS)
+_SCHEDULES = ("static", "reversal", "drifting")
 
 FAMILIES = (
     Family("Reach1DOF-v0", "scilab_rl.envs.reach_1dof:Reach1DOF", 50),
@@ -166,8 +169,8 @@ FAMILIES = (
         "Bandit-v0",
         "scilab_rl.envs.choices.bandit:Bandit",
         None,
-        "Bandit-{static,reversal,drifting}-a{2..10}-v0",
-        r"Bandit-(?P<schedule>static|reversal|drifting)-a(?P<n_arms>[2-9]|10)",
+        f"Bandit-{{{','.join(_SCHEDULES)}}}-a{{2..10}}-v0",
+        rf"Bandit-(?P<schedule>{'|'.join(_SCHEDULES)})-a(?P<n_arms>[2-9]|10)",
         _read_bandit,
     ),
     Family("ProbabilisticReversal-v0", "scilab_rl.envs.choices.bandit:ProbabilisticReversal", None),
@@ -177,8 +180,12 @@ FAMILIES = (
 )
 
 
+_WORDS = (*(f.name for f in FAMILIES if f.grammar), *_MAPS, *_REWARDS, *_GRIPPERS, *_SCHEDULES)
+
+
 def register_shipped() -> None:
     """Make the ids known; nothing is imported before one of them is made."""
+    _let_gymnasium_read_long_ids()
     for family in FAMILIES:
         if family.env_id not in registration.registry:
             registration.register(
@@ -216,10 +223,42 @@ def register_variant(name: str) -> tuple[str, str] | None:
             return None
         match = re.fullmatch(family.pattern + _VERSION, name)
         if match is None:
-            raise ConfigError(f"No environment '{name}'. Its variants are {family.grammar}.")
+            raise ConfigError(
+                f"No environment '{name}'.{_did_you_mean(name)} Its variants are {family.grammar}."
+            )
         env_id = f"{re.sub(_VERSION + '$', '', name)}-{family.version}"
         return env_id, _register(family, env_id, family.read(match.groupdict()))
+    if name not in registration.registry and (suggestion := _did_you_mean(name)):
+        raise ConfigError(f"No environment '{name}'.{suggestion}")
     return None
+
+
+@functools.cache
+def _let_gymnasium_read_long_ids() -> None:
+    """Let ``gymnasium.make`` and ``make_vec`` register the variant that they are given, once.
+
+    Gymnasium asks nobody about an id that it does not know. This is the one function with which
+    both look an id up.
+    """
+    find_spec = registration._find_spec
+
+    @functools.wraps(find_spec)
+    def find_spec_or_variant(env_id: str) -> EnvSpec:
+        name = env_id.rpartition(":")[2]
+        if name in registration.registry:
+            return find_spec(env_id)
+        variant = register_variant(name)
+        return find_spec(env_id if variant is None else variant[0])
+
+    registration._find_spec = find_spec_or_variant
+
+
+def _did_you_mean(name: str) -> str:
+    """Return a suggestion with each misspelled word of a long id put right, if there is one."""
+    right = "-".join(nearest_word(word, _WORDS) or word for word in name.split("-"))
+    if right != name and any(re.fullmatch(f.pattern + _VERSION, right) for f in FAMILIES):
+        return f" Did you mean '{right}'?"
+    return ""
 
 
 def _register(family: Family, env_id: str, arguments: Arguments) -> str:
