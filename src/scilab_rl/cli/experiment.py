@@ -28,7 +28,7 @@ def main(arguments: list[str]) -> int:
     planned = plan(groups, fixed, n_seeds, options.first_seed, options.base_logdir)
     _log.info("%s", power_of(n_seeds, len(planned)))
     if not any(group.stops_early for group in planned):
-        _log.info("All runs train to their last epoch; early_stop_threshold=0.9 stops them early.")
+        _log.info("All runs train to their last epoch, so that they can be compared fairly.")
     for group in planned:
         _log.info(
             "%s: %d of %d runs exist; training %d.",

@@ -54,7 +54,10 @@ def main(arguments: list[str]) -> int:
         columns = _COLUMNS if is_terminal() else ("run", *_COLUMNS)
         print_rows(columns, shown, optional=_OPTIONAL, if_any=_IF_ANY, prose=_PROSE)
     else:
-        _log.info("No such runs in '%s'. Each training creates one.", options.base_logdir)
+        _log.info(
+            "No such runs in %s, the folder of the place where you are. Each training creates one.",
+            options.base_logdir.absolute(),
+        )
     return 0
 
 

@@ -353,7 +353,7 @@ def unknown_key(name: str) -> ConfigError:
     known = [*(key.name for key in KEYS), *GROUPS, *ALIASES]
     return ConfigError(
         f"There is no key '{name}'.{did_you_mean(name.partition('.')[0], known)} "
-        "`scilab-rl --help` lists all keys."
+        "`scilab-rl --help all` lists all keys."
     )
 
 

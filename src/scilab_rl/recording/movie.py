@@ -51,7 +51,6 @@ NO_VALUE = "-"  # the font has no dash
 _SMOOTH = 2  # everything that does not move is drawn twice as large and scaled down
 WENT_WRONG = ("fell", "lost")  # words of events
 _HELD = 1.5  # seconds; the last frame stays, because players start again at once
-_APART = 60.0  # pixels between the names of events
 _TITLE, _LEFT, _RIGHT, _BOTTOM = 22, 50, 12, 18  # pixels around the curves
 
 
@@ -424,17 +423,17 @@ class PanelSheet:
 
     def _draw_events(self, draw: ImageDraw, panel: _Panel) -> None:
         """Draw a line at each event through all panels; those on top name it."""
-        written = -_APART  # where the last name stands
+        free = 0.0  # from where on no name stands
         for index, event in self.events:
             x, color = self._x(panel, index), event_color(event)
             ends = [_big(x, panel.top), _big(x, panel.bottom)]
             draw.line(ends, fill=_faded(color), width=_SMOOTH)
-            if panel.top == _TITLE and x - written >= _APART:
-                written = x
-                is_late = x > (panel.left + panel.right) / 2
-                where = _big(x - 3 if is_late else x + 3, panel.top + 2)
-                letters, anchor = font(10 * _SMOOTH), "rt" if is_late else "lt"
-                draw.text(where, event, fill=color, font=letters, anchor=anchor)
+            letters = font(10 * _SMOOTH)
+            width = draw.textlength(event, letters) / _SMOOTH
+            left = x + 3 if x + 3 + width <= panel.right else x - 3 - width
+            if panel.top == _TITLE and left >= free:
+                free = left + width + 3
+                draw.text(_big(left, panel.top + 2), event, fill=color, font=letters, anchor="lt")
 
     def _draw_curves(self, draw: ImageDraw, panel: _Panel) -> None:
         for number, curve in enumerate(panel.curves.values()):

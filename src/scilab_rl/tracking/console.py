@@ -41,7 +41,7 @@ class ConsoleTracker(Tracker):
         tuned = " with tuned values" if tuned_option(cfg.values()) else ""
         self._say(
             f"{cfg.algorithm.name} learns {cfg.env}{tuned} (seed {cfg.seed}, up to {cfg.n_epochs} "
-            f"epochs); results: {run.run_dir}"
+            f"{'epoch' if cfg.n_epochs == 1 else 'epochs'}); results: {run.run_dir}"
         )
         if self.live:
             self._progress = Progress(
