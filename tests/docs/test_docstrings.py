@@ -16,6 +16,7 @@ NEEDS = {
     "jax_engine": "jax",
     "jax_off_policy": "jax",
     "jaxcrl": "jax",
+    "jaxgciql": "jax",
     "jaxsac": "jax",
     "jaxtd3": "jax",
 }

@@ -32,6 +32,7 @@ ORACLE = {
     "ddpg": _SB3_MOVES,
     "dqn": _CHOICES,
     "jaxcrl": "--y------------",  # it learns from goals alone
+    "jaxgciql": "--y------------",
     "jaxsac": _MOVES,
     "jaxtd3": _MOVES,
     "onestepac": _CHOICES,
@@ -154,6 +155,7 @@ def train(algorithm: str, name: str, tmp_path: Path, *overrides: str) -> None:
     )
     more += ["algorithm.batch_size=16"] if more else []
     more += ["algorithm.buffer_size=200"] if algorithm in ("dqn", "qrdqn", "cleandqn") else []
+    more += ["algorithm.data=random:3"] if algorithm == "jaxgciql" else []
     done = scilab_rl(f"algorithm={algorithm}", f"env={MODULE}:{name}", *SHORT, *more, *overrides,
                      cwd=tmp_path, timeout=300)  # fmt: skip
     assert done.code == 0, done.errors

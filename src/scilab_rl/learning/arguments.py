@@ -17,6 +17,7 @@ _HIDDEN = ("self", "_init_setup_model", "env", "seed", "device", "verbose", "ten
 INTRINSIC = "intrinsic"
 # Off-policy algorithms take demonstrations through their replay buffer, see `run.demonstrations`.
 DEMOS = "demos"
+DATA = "data"  # of offline algorithms, in the same module
 
 _FRACTION = (0.0, 1.0)
 _POSITIVE = (math.ulp(0.0), math.inf)
@@ -33,6 +34,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "weight_critic_var": _FRACTION,
     "random_actions": _FRACTION,
     "random_actions_end": _FRACTION,
+    "expectile": _FRACTION,
     "learning_rate": _POSITIVE,
     "batch_size": _AT_LEAST_1,
     "buffer_size": _AT_LEAST_1,
@@ -44,6 +46,7 @@ RANGES: dict[str, tuple[float, float]] = {
     "target_update_interval": _AT_LEAST_1,
     "learning_starts": _AT_LEAST_0,
     "bc_weight": _AT_LEAST_0,
+    "inverse_temperature": _AT_LEAST_0,
     "max_grad_norm": _POSITIVE,
     "clip_range": _POSITIVE,
 }

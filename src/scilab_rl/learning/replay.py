@@ -333,6 +333,8 @@ class HindsightReplayBuffer(HerReplayBuffer):
         """
         if self.demos is None:
             return self._draw(batch_size, env)
+        if self.demo_share == 1:
+            return self.demos._draw(batch_size, env)
         chosen = self.from_demos(batch_size)
         own = self._draw(batch_size - int(chosen.sum()), env)
         shown = self.demos._draw(int(chosen.sum()), env)

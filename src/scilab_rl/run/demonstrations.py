@@ -4,68 +4,69 @@ Vecerik et al., 2017, arXiv 1707.08817, and Nair et al., 2018, arXiv 1709.10089,
 next to what the agent experiences, and draw a share of each batch from them. Here they lie in a
 ring of the hindsight replay buffer. They are collected once, before the first step; a checkpoint
 has them, so that a resumed run needs neither their source nor the time.
+
+The data set of an offline algorithm takes the same way; it is all that there is to draw from.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from scilab_rl.config.schema import RunConfig
 from scilab_rl.errors import ConfigError, MissingDependencyError, did_you_mean
-from scilab_rl.learning.arguments import DEMOS
+from scilab_rl.learning.arguments import DATA, DEMOS
 from scilab_rl.metrics.success import success_of
-from scilab_rl.run.directory import CONFIG_FILE, find_policy, find_run
+from scilab_rl.run.controllers import RANDOM, SCRIPTED, Step, controlled_env, play_episode
 from scilab_rl.seeding import derive_seed
 
 if TYPE_CHECKING:  # heavy
     import gymnasium as gym
 
-    from scilab_rl.envs.types import Info, Observation
+    from scilab_rl.envs.scripted import Controller
     from scilab_rl.learning.algorithm import Algorithm
     from scilab_rl.learning.replay import HindsightReplayBuffer
 
-_KINDS = ("scripted", "run", "minari")
+_EXAMPLES = {
+    SCRIPTED: "scripted:100", RANDOM: "random:100", "run": "run:RUN:100", "minari": "minari:ID",
+}  # fmt: skip
+_DATA_KINDS = tuple(_EXAMPLES)
+_DEMO_KINDS = tuple(kind for kind in _EXAMPLES if kind != RANDOM)
 _SETTINGS = ("source", "share")
-_EXAMPLES = "scripted:100, run:RUN, run:RUN:100 or minari:ID"
 _N_EPISODES = 100  # of a run, by default
 _MOST_TRIES = 50  # per demonstration: what succeeds so rarely is not one
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class Step:
-    """One step of a demonstration, in the environment's own units."""
-
-    observation: Observation
-    action: Any
-    reward: float
-    terminated: bool
-    truncated: bool
-    info: Info
-    next_observation: Observation
-
-
-@dataclass(frozen=True)
 class DemoSettings:
-    """The key ``algorithm.demos``.
+    """The key ``algorithm.demos``, or ``algorithm.data`` of an offline algorithm.
 
     Attributes:
-        kind: ``scripted``, ``run`` or ``minari``.
+        kind: ``scripted``, ``run``, ``minari`` or, as data, ``random``.
         name: Of the run or the data set.
-        n_episodes: How many; 0: all of a data set.
-        share: Of each batch.
+        n_episodes: How many; 0: all of a data set of Minari.
+        share: Of each batch. Data are all of it, and their failures count too.
     """
 
     kind: str
     name: str
     n_episodes: int
     share: float
+
+    @property
+    def is_data_set(self) -> bool:
+        """Whether there is nothing else to learn from."""
+        return self.share == 1
+
+    @property
+    def key(self) -> str:
+        """What the user has set."""
+        return f"algorithm.{DATA if self.is_data_set else DEMOS}"
 
 
 def parse_demos(chosen: object) -> DemoSettings:
@@ -91,18 +92,53 @@ def parse_demos(chosen: object) -> DemoSettings:
         raise ConfigError(
             f"algorithm.demos.share must be a number between 0 and 1, but it is {share!r}."
         )
-    source = str(settings.get("source"))
+    return _parse_source("algorithm.demos", settings.get("source"), _DEMO_KINDS, float(share))
+
+
+def parse_data(source: object) -> DemoSettings:
+    """Read ``algorithm.data``: the source of a data set.
+
+    Raises:
+        ConfigError: If it is none.
+
+    >>> parse_data("random:100")
+    DemoSettings(kind='random', name='', n_episodes=100, share=1.0)
+    """
+    return _parse_source("algorithm.data", source, _DATA_KINDS, 1.0)
+
+
+def _parse_source(key: str, given: object, kinds: Sequence[str], share: float) -> DemoSettings:
+    source = str(given)
     kind, _, rest = source.partition(":")
     name, _, number = rest.rpartition(":")
-    if kind != "scripted" and not (name and number.isdigit()):
+    has_name = kind not in (SCRIPTED, RANDOM)
+    if has_name and not (name and number.isdigit()):
         name, number = rest, str(_N_EPISODES if kind == "run" else 0)
     is_whole = number.isdigit() and (kind == "minari" or int(number) > 0)
-    if kind not in _KINDS or not rest or not is_whole or (kind == "scripted" and name):
+    if kind not in kinds or not rest or not is_whole or (name and not has_name):
+        examples = [_EXAMPLES[kind] for kind in kinds]
         raise ConfigError(
-            f"algorithm.demos must be {_EXAMPLES}, but it is {source!r}."
-            f"{did_you_mean(kind, _KINDS)}"
+            f"{key} must be {', '.join(examples[:-1])} or {examples[-1]}, but it is {source!r}."
+            f"{did_you_mean(kind, kinds)}"
         )
-    return DemoSettings(kind, name, int(number), float(share))
+    return DemoSettings(kind, name, int(number), share)
+
+
+def chosen_source(cfg: RunConfig, algorithm: Algorithm) -> DemoSettings | None:
+    """Return the demonstrations or the data set that a configuration names.
+
+    Raises:
+        ConfigError: If an offline algorithm is given no data.
+    """
+    arguments = cfg.algorithm.arguments
+    if not getattr(algorithm, "learns_offline", False):
+        return None if arguments.get(DEMOS) is None else parse_demos(arguments[DEMOS])
+    if arguments.get(DATA) is None:
+        raise ConfigError(
+            f"{cfg.algorithm.name} learns from a data set alone; name one: algorithm.data="
+            f"{' or '.join(_EXAMPLES.values())}."
+        )
+    return parse_data(arguments[DATA])
 
 
 def prepare_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
@@ -113,10 +149,9 @@ def prepare_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
     """
     from scilab_rl.learning.replay import HindsightReplayBuffer
 
-    chosen = cfg.algorithm.arguments.get(DEMOS)
-    if chosen is None:
+    settings, buffer = chosen_source(cfg, algorithm), getattr(algorithm, "replay_buffer", None)
+    if settings is None:
         return
-    settings, buffer = parse_demos(chosen), getattr(algorithm, "replay_buffer", None)
     if not isinstance(buffer, HindsightReplayBuffer):
         raise ConfigError(
             f"algorithm.demos needs our own hindsight replay, which {cfg.algorithm.name} does not "
@@ -136,7 +171,8 @@ def collect_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
     ring = getattr(getattr(algorithm, "replay_buffer", None), "demos", None)
     if ring is None:
         return
-    settings, n_episodes, n_steps = parse_demos(cfg.algorithm.arguments[DEMOS]), 0, 0
+    settings, n_episodes, n_steps = chosen_source(cfg, algorithm), 0, 0
+    assert settings is not None  # the ring was made for it
     for episode in _episodes(settings, cfg):
         for step in episode:
             _store(ring, algorithm, step)
@@ -145,7 +181,9 @@ def collect_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
     normalizer = getattr(algorithm, "normalizer", None)
     if normalizer is not None:
         normalizer.update(ring.rows[: n_steps + n_episodes, 0])
-    _log.info("%d demonstrations with %d steps from %s.", n_episodes, n_steps, settings.kind)
+    _log.info(
+        "%s: %d episodes with %d steps from %s.", settings.key, n_episodes, n_steps, settings.kind
+    )
 
 
 def _n_rows(settings: DemoSettings, algorithm: Algorithm) -> int:
@@ -156,7 +194,11 @@ def _n_rows(settings: DemoSettings, algorithm: Algorithm) -> int:
         data = _data_set(settings.name)
         return int(data.total_steps + data.total_episodes)
     longest = longest_episode(algorithm.get_env())
-    assert longest is not None  # hindsight replay needs a step limit
+    if longest is None:
+        raise ConfigError(
+            f"{settings.key} needs episodes with a step limit, and this environment has none; add "
+            "+env_kwargs.max_episode_steps=N."
+        )
     return settings.n_episodes * (longest + 1)
 
 
@@ -178,71 +220,35 @@ def _store(ring: HindsightReplayBuffer, algorithm: Any, step: Step) -> None:
 
 def _episodes(settings: DemoSettings, cfg: RunConfig) -> Iterator[list[Step]]:
     if settings.kind == "minari":
-        return _stored_episodes(settings)
-    if settings.kind == "run":
-        return _episodes_of_run(settings, cfg)
-    return _scripted_episodes(settings, cfg)
+        yield from _stored_episodes(settings)
+        return
+    seed = derive_seed(cfg.seed, "demos")
+    name = settings.name or settings.kind
+    with controlled_env(name, cfg, seed, key=settings.key) as (env, controller):
+        if settings.is_data_set:
+            yield from _all_episodes(settings, env, controller, seed)
+        else:
+            yield from _successes(settings, env, controller, seed)
 
 
-def _scripted_episodes(settings: DemoSettings, cfg: RunConfig) -> Iterator[list[Step]]:
-    from scilab_rl.envs.scripted import controller_for
-    from scilab_rl.envs.vectorize import make_single_env
-
-    env = make_single_env(cfg)
-    try:
-        controller = controller_for(env)
-        yield from _successes(settings, cfg, env, controller.act, controller.begin)
-    finally:
-        env.close()
-
-
-def _episodes_of_run(settings: DemoSettings, cfg: RunConfig) -> Iterator[list[Step]]:
-    from scilab_rl.canonical_spaces import conversions
-    from scilab_rl.config.recorded import load_recorded
-    from scilab_rl.envs.vectorize import make_single_env
-    from scilab_rl.learning.inspector import observation_functions
-    from scilab_rl.learning.observations import batch_of_one
-    from scilab_rl.run.player import load_player
-
-    run = find_run(settings.name, Path(cfg.base_logdir))
-    theirs = load_recorded(run / CONFIG_FILE)
-    if (theirs.env, dict(theirs.env_kwargs)) != (cfg.env, dict(cfg.env_kwargs)):
-        raise ConfigError(
-            f"algorithm.demos: {run} was trained in {theirs.env}, which is not {cfg.env} with "
-            "these env_kwargs; name a run of the same environment."
-        )
-    saved = find_policy(run, settings.name, "best", "finished")
-    their_env, model = load_player(theirs, saved, record=False)
-    functions, to_env = observation_functions(their_env), conversions(their_env)[0].to_env
-
-    def act(observation: Any) -> Any:
-        batch = batch_of_one(observation)
-        for function in functions:
-            batch = function(batch)
-        return to_env(model.predict(batch, deterministic=True)[0])[0]
-
-    env = make_single_env(theirs)
-    try:
-        yield from _successes(settings, cfg, env, act)
-    finally:
-        env.close()
-        their_env.close()
+def _all_episodes(
+    settings: DemoSettings, env: gym.Env, controller: Controller, seed: int
+) -> Iterator[list[Step]]:
+    n_successes = 0
+    for index in range(settings.n_episodes):
+        episode = play_episode(env, controller, None if index else seed)
+        n_successes += bool(success_of(episode[-1].info))
+        yield episode
+    _log.info("%d of %d episodes were successful.", n_successes, settings.n_episodes)
 
 
 def _successes(
-    settings: DemoSettings,
-    cfg: RunConfig,
-    env: gym.Env,
-    act: Callable[[Any], Any],
-    begin: Callable[[], None] = lambda: None,
+    settings: DemoSettings, env: gym.Env, controller: Controller, seed: int
 ) -> Iterator[list[Step]]:
     """Yield episodes that end in success; all of them where the task does not report it."""
-    seed: int | None = derive_seed(cfg.seed, "demos")
     n_found = 0
     for n_tries in range(1, _MOST_TRIES * settings.n_episodes + 1):
-        begin()
-        episode = _play(env, act, seed)
-        seed = None
+        episode = play_episode(env, controller, seed if n_tries == 1 else None)
         if success_of(episode[-1].info) is False:
             continue
         yield episode
@@ -254,17 +260,6 @@ def _successes(
         f"algorithm.demos: only {n_found} of {n_tries} episodes were successful, and "
         f"{settings.n_episodes} demonstrations are wanted; take another source."
     )
-
-
-def _play(env: gym.Env, act: Callable[[Any], Any], seed: int | None) -> list[Step]:
-    observation, _ = env.reset(seed=seed)
-    steps: list[Step] = []
-    while not steps or not (steps[-1].terminated or steps[-1].truncated):
-        action = np.asarray(act(observation), env.action_space.dtype)
-        after, reward, terminated, truncated, info = env.step(action)
-        steps.append(Step(observation, action, float(reward), terminated, truncated, info, after))
-        observation = after
-    return steps
 
 
 def _data_set(name: str) -> Any:
@@ -282,7 +277,7 @@ def _data_set(name: str) -> Any:
         raise MissingDependencyError("minari", "minari", "to read demonstrations") from error
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"algorithm.demos: there is no Minari data set '{name}' on this machine; get it with: "
+            f"There is no Minari data set '{name}' on this machine; get it with: "
             f"minari download {name}"
         ) from error
 
@@ -294,7 +289,7 @@ def _stored_episodes(settings: DemoSettings) -> Iterator[list[Step]]:
         observations = episode.observations
         if not isinstance(observations, dict) or "desired_goal" not in observations:
             raise ConfigError(
-                f"algorithm.demos: the observations of '{settings.name}' have no goals."
+                f"{settings.key}: the observations of '{settings.name}' have no goals."
             )
         rows = [
             {key: observations[key][i] for key in ("observation", "achieved_goal", "desired_goal")}

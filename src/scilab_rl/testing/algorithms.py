@@ -38,11 +38,12 @@ from scilab_rl.envs.vec_step import Observation
 from scilab_rl.envs.vectorize import make_single_env, make_train_env, observed_layer
 from scilab_rl.errors import ConfigError
 from scilab_rl.learning.algorithm import Algorithm
-from scilab_rl.learning.arguments import FRAMEWORK_PARAMETERS, allowed_arguments
+from scilab_rl.learning.arguments import DATA, FRAMEWORK_PARAMETERS, allowed_arguments
 from scilab_rl.learning.compatibility import check_pair
 from scilab_rl.learning.declared import declared_metrics, differences
 from scilab_rl.metrics.logger import MetricLogger, as_number
 from scilab_rl.run.checks import prepare_torch
+from scilab_rl.run.demonstrations import collect_demos, prepare_demos
 from scilab_rl.run.parts import make_algorithm
 from scilab_rl.training import checkpoint
 from scilab_rl.training.policy import load_policy, policy_state
@@ -245,6 +246,8 @@ class AlgorithmContract:
         cfg = self._configuration(n_envs, seed)
         prepare_torch(cfg)
         model = make_algorithm(cfg, make_train_env(cfg))
+        prepare_demos(cfg, model)
+        collect_demos(cfg, model)
         model.set_logger(MetricLogger())
         return model
 
@@ -397,6 +400,8 @@ def _small(cls: type, given: Mapping[str, Any]) -> dict[str, object]:
         for name, limit in limits.items()
         if name in allowed
     }
+    if getattr(cls, "learns_offline", False):
+        small[DATA] = "random:20"
     if "policy_kwargs" in allowed:
         small["policy_kwargs"] = {**(given.get("policy_kwargs") or {}), "net_arch": _SMALL_NETWORK}
     if "net_arch" in allowed:

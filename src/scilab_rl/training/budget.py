@@ -50,6 +50,8 @@ def check_budget(cfg: RunConfig, algorithm: Algorithm) -> None:
             f"n_envs={n_envs} environments; use eval_after_n_steps={n_envs} or more, or "
             f"n_envs={epoch_steps} or fewer."
         )
+    if getattr(algorithm, "learns_offline", False):
+        return  # its data are there before the first update
     _check_buffer(algorithm)
     _tell_large_batch(algorithm, n_envs)
     first = first_update(algorithm)

@@ -38,6 +38,7 @@ CHOICE, GOALS_CHOICE = (
 CASES = [
     *((name, GOALS) for name in ("cleansac", "cleansacmc", "actor_critic", "jaxsac", "jaxtd3")),
     ("jaxcrl", GOALS),
+    ("jaxgciql", GOALS),
     *((name, GOALS) for name in ("sac", "td3", "ddpg", "tqc", "ppo", "cleanppo")),
     *((name, BOX) for name in ("cleansac", "jaxsac", "sac", "td3", "ppo", "cleanppo", "a2c")),
     *((name, CHOICE) for name in ("cleandqn", "dqn", "qrdqn", "ppo", "cleanppo", "onestepac")),

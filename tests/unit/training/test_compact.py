@@ -27,6 +27,7 @@ PAIRS = {
     "jaxsac": ("TinyReach-v0", None),
     "jaxtd3": ("TinyBox-v0", None),
     "jaxcrl": ("TinyReach-v0", None),
+    "jaxgciql": ("TinyReach-v0", None),
     "recurrentppo": ("TinyBox-v0", None),
 }
 
