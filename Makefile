@@ -42,7 +42,14 @@ setup: $(VENV)/.installed  ## create .venv and install the pinned dependencies
 	.venv-peers/bin/pip install --quiet --no-deps --ignore-requires-python cleanrl==1.2.0
 	@touch $@
 
-bench: $(VENV)/.installed .venv-peers/.installed  ## all benchmarks (hours; BENCH="startup updates": only these)
+# hBayesDM requires PyStan 2; what is used are its model files and its example data.
+.venv-hbayesdm/.installed: benchmarks/peers/hbayesdm.txt
+	$(PYTHON) -m venv .venv-hbayesdm
+	.venv-hbayesdm/bin/pip install --quiet -r benchmarks/peers/hbayesdm.txt
+	.venv-hbayesdm/bin/pip install --quiet --no-deps hbayesdm==1.1.1
+	@touch $@
+
+bench: $(VENV)/.installed .venv-peers/.installed .venv-hbayesdm/.installed  ## all benchmarks (hours; BENCH="startup updates": only these)
 	$(BIN)/python benchmarks/all.py $(BENCH)
 
 demo: setup  ## train a Fetch robot arm to reach its goal, and film it before, during and after (a minute or two)

@@ -54,6 +54,9 @@ BENCHMARKS = {
     "board": Benchmark(("board.py",), "the board of 1,000 runs: size, time to open", 1),
     "metrics": Benchmark(("load.py", "metrics"), "values recorded per second", 1),
     "exported": Benchmark(("exported_policies.py",), "policies for robots: exactness, time", 3),
+    "hbayesdm": Benchmark(
+        ("hbayesdm_data.py",), "people's choices: ours and hBayesDM's models", 50
+    ),
     "reach": Benchmark(("time_to_success.py", "reach"), "time until FetchReach is mastered", 40),
     "push": Benchmark(("time_to_success.py", "push"), "time until FetchPush is mastered", 50),
     "pick": Benchmark(("time_to_success.py", "pick"), "FetchPickAndPlace in a fixed budget", 300),

@@ -72,6 +72,13 @@ SMALLEST = {
     "exported": (
         ["exported_policies.py", "--agents", "CartPole", "--observations", "100"], "agents",
     ),
+    "hbayesdm": (
+        [
+            "hbayesdm_data.py", "--simulated", "--only", "bandit2arm_delta", "--warmup", "20",
+            "--samples", "20",
+        ],
+        "bandit2arm_delta",
+    ),
     "reach": (
         [
             "time_to_success.py", "reach", "n_epochs=1", "eval_after_n_steps=60",
@@ -100,6 +107,8 @@ def test_runs_in_its_smallest_size(name: str, tmp_path: Path, benchmarks: Any) -
     if name == "cost":
         pytest.importorskip("mlflow")
         pytest.importorskip("tensorboard")
+    if name == "hbayesdm":
+        pytest.importorskip("numpyro")
     if name == "board" and EXECUTABLE is None:
         pytest.skip("needs Chromium")
     words, expected = SMALLEST[name]
@@ -169,6 +178,71 @@ def test_a_gpu_is_compared_with_the_cpu_in_the_same_turns(benchmarks: Any) -> No
     assert (row["cpu"], row["cuda"], row["times"]) == (20.0, 60.0, 3.0)  # of 4, 2 and 3
     assert set(gpu.compare({"cpu": times["cpu"]}, n_steps=120)) == {"cpu"}
     assert "3.00" in gpu.table({"jaxsac 256,256,256": row})
+
+
+def softmax(values: np.ndarray) -> np.ndarray:
+    return np.exp(values) / np.exp(values).sum()
+
+
+def one_stage(rows: list[dict], rates: dict[int, float], beta: float) -> float:
+    """The loop of bandit2arm_delta.stan and prl_rp.stan, with a rate for each sign."""
+    values, total = np.zeros(2), 0.0
+    for row in rows:
+        choice, outcome = row["choice"] - 1, row["outcome"]
+        total += np.log(softmax(beta * values)[choice])
+        values[choice] += rates[outcome] * (outcome - values[choice])
+    return total
+
+
+def two_stages(rows: list[dict], a: float, beta: float, pi: float, w: float) -> float:
+    """The loop of ts_par4.stan."""
+    v, total, before = np.zeros(6), 0.0, None
+    for row in rows:
+        first, second, reward = row["level1_choice"] - 1, row["level2_choice"] + 1, row["reward"]
+        best = np.array([v[2:4].max(), v[4:6].max()])
+        mixed = w * (0.7 * best + 0.3 * best[::-1]) + (1 - w) * v[:2]
+        stay = np.zeros(2) if before is None else pi * np.eye(2)[before]
+        total += np.log(softmax(beta * mixed + stay)[first])
+        v[first] += a * (v[second] - v[first])
+        start = 2 if second < 4 else 4
+        total += np.log(softmax(beta * v[start : start + 2])[second - start])
+        v[second] += a * (reward - v[second])
+        v[first] += a * (reward - v[second])
+        before = first
+    return total
+
+
+def test_models_of_hbayesdm_have_the_likelihoods_of_its_programs(benchmarks: Any) -> None:
+    pytest.importorskip("numpyro")
+    from scilab_rl.analysis.fitting.panel import make_panel
+    from scilab_rl.analysis.fitting.selection import choice_probabilities
+
+    data, rng = benchmarks("hbayesdm_data"), np.random.default_rng(0)
+    names = {"choice": (1, 2), "outcome": (-1, 1), "level1_choice": (1, 2),
+             "level2_choice": (1, 2, 3, 4), "reward": (0, 1)}  # fmt: skip
+    drawn = [{name: int(rng.choice(of)) for name, of in names.items()} for _ in range(60)]
+    one = [{"subjID": "1", "choice": r["choice"], "outcome": r["outcome"]} for r in drawn]
+    two = [{"subjID": "1", **{k: r[k] for k in [*names][2:]}} for r in drawn]
+    for name, rows, values, expected in (
+        ("bandit2arm_delta", one, {"A": 0.3, "tau": 1.2}, one_stage(one, {1: 0.3, -1: 0.3}, 1.2)),
+        (
+            "prl_rp",
+            one,
+            {"Apun": 0.2, "Arew": 0.6, "beta": 2.0},
+            one_stage(one, {1: 0.6, -1: 0.2}, 2.0),
+        ),
+        (
+            "ts_par4",
+            two,
+            {"a": 0.4, "beta": 3.0, "pi": 0.5, "w": 0.7},
+            two_stages(two, 0.4, 3.0, 0.5, 0.7),
+        ),
+    ):
+        task, panel = data.TASKS[name], make_panel(rows)
+        ours = {own: np.full(1, values[k] * by) for k, (own, by) in task.names.items()}
+        each = choice_probabilities(task.model, panel, ours)
+        chosen = np.take_along_axis(each, panel.responses[..., None], axis=2)
+        assert np.log(chosen).sum() == pytest.approx(expected, rel=1e-5), name
 
 
 def test_turns_go_forwards_and_backwards(benchmarks: Any) -> None:

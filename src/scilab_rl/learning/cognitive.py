@@ -76,12 +76,15 @@ class Parameter:
             with both bounds it is logistic.
         mean: Of its normal prior on the real scale.
         sd: Of that prior.
+        spread_sd: Of the half-normal prior of the standard deviation between participants, on the
+            real scale; None: as ``sd``.
     """
 
     low: float = -math.inf
     high: float = math.inf
     mean: float = 0.0
     sd: float = 1.0
+    spread_sd: float | None = None
 
     def from_real(self, x: Any, xp: ModuleType = jnp) -> Any:
         """Return the parameter that belongs to any real number."""

@@ -58,7 +58,7 @@ def test_people_agents_and_models_stand_side_by_side(compared):
 def test_a_single_agent_is_measured_over_its_episodes(compared):
     found = compared("people.csv", "last=last", "--episodes=6")
     last = found["last", "after a loss"]
-    assert (last["n"], last["unit"]) == (6, "blocks of one")
+    assert (last["n"], last["unit"]) == (6, "blocks")
     assert last["low"] < last["mean"] < last["high"]  # it chooses by chance
 
 

@@ -26,7 +26,7 @@ class BehaviorGroup:
         label: Name in tables.
         meaning: Who they are.
         panel: Their choices; of a single one who made several blocks, a row per block.
-        unit: What intervals are computed over: participants, or the blocks of a single one.
+        unit: What intervals are computed over: participants, or blocks of a single one.
         shares: What they do.
         curves: How that changes.
     """
@@ -49,7 +49,7 @@ def behavior_group(label: str, meaning: str, panel: Panel) -> BehaviorGroup:
     """
     unit = "participants"
     if len(panel.participants) == 1 and panel.seen.is_first.sum() > 1:
-        unit = "blocks of one"
+        unit = "blocks"
         panel = make_panel(
             [dict(row, participant_id=str(row.get("block"))) for row in panel.rows[0]]
         )
@@ -126,7 +126,7 @@ def _shown(curve: Curve) -> tuple[int, int, int]:
 
 
 def _name(curve: Curve) -> str:
-    return f"{curve.y_label}, {curve.x_label}"
+    return f"{curve.y_label.removeprefix('share of ')}, {curve.x_label}"
 
 
 def _text(row: Mapping[str, Any]) -> str:
@@ -141,17 +141,18 @@ def _known(number: float) -> float | None:
     return number if np.isfinite(number) else None
 
 
-def interval_rows(behaviors: Mapping[str, Behavior]) -> list[Interval]:
-    """Return rows of a forest plot: each condition, with all groups in their colors."""
-    first = next(iter(behaviors.values()))
-    rows = []
-    for condition in first:
+def condition_rows(behaviors: Mapping[str, Behavior]) -> list[tuple[str, list[Interval]]]:
+    """Return each condition with the rows of a forest plot, one for each group."""
+    conditions = []
+    for condition in next(iter(behaviors.values())):
+        rows = []
         for color, (name, behavior) in enumerate(behaviors.items()):
             mean, low, high = mean_interval(behavior[condition])
             if np.isfinite(mean):
                 ends = (low, high) if np.isfinite(low) else (mean, mean)
-                rows.append(Interval(f"{condition}: {name}", mean, *ends, color=color))
-    return rows
+                rows.append(Interval(name, mean, *ends, color=color))
+        conditions.append((condition, rows))
+    return [(condition, rows) for condition, rows in conditions if rows]
 
 
 def curve_charts(curves: Mapping[str, Sequence[Curve]]) -> list[tuple[Curve, list[Series]]]:
@@ -185,10 +186,10 @@ def behavior_page(groups: Sequence[BehaviorGroup], task: str) -> str:
     ]
     return render(
         "behavior.html",
-        title=" and ".join(group.label for group in groups),
+        title=f"{', '.join(columns[1:-1])} and {columns[-1]}",
         task=task,
         groups=about,
-        rows=interval_rows({group.label: group.shares for group in groups}),
+        choices=condition_rows({group.label: group.shares for group in groups}),
         curves=curve_charts({group.label: group.curves for group in groups}),
         numbers=(columns, [[row.get(name) for name in columns] for row in rows]),
     )

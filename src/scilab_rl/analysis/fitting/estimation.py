@@ -139,12 +139,17 @@ def check_panel(name: str, model: type[CognitiveModel], panel: Panel) -> None:
 
 
 def fit(
-    name: str, panel: Panel, *, method: str = MAP, n_restarts: int = N_BATCHES, seed: int = 0
+    model: str | type[CognitiveModel],
+    panel: Panel,
+    *,
+    method: str = MAP,
+    n_restarts: int = N_BATCHES,
+    seed: int = 0,
 ) -> Fit:
     """Estimate the parameters of each participant.
 
     Args:
-        name: Of the model.
+        model: The model, or its name.
         panel: The choices.
         method: ``map``, or ``mle`` without the prior.
         n_restarts: Random starts per participant.
@@ -153,7 +158,9 @@ def fit(
     Raises:
         ConfigError: If the model cannot be one of these choices.
     """
-    model = find_model(name)
+    name, model = (
+        (model, find_model(model)) if isinstance(model, str) else (model.__name__.lower(), model)
+    )
     check_panel(name, model, panel)
     starts = _good_starts(model, panel, method, n_restarts, seed)
     x, loss, gradient, hessian = minimize(model, panel, method, starts)

@@ -109,11 +109,14 @@ def sample_posterior(
         jnp.array([getattr(p, name) for p in fitted.model.parameters.values()])
         for name in ("mean", "sd")
     )
+    spreads = jnp.array(
+        [p.sd if p.spread_sd is None else p.spread_sd for p in fitted.model.parameters.values()]
+    )
     shape, choices = fitted.real.shape, _log_likelihood(fitted)
 
     def population() -> None:
         mu = numpyro.sample("group", dist.Normal(mean, sd).to_event(1))
-        sigma = numpyro.sample("spread", dist.HalfNormal(sd).to_event(1))
+        sigma = numpyro.sample("spread", dist.HalfNormal(spreads).to_event(1))
         z = numpyro.sample("z", dist.Normal(0.0, 1.0).expand(shape).to_event(2))
         numpyro.factor("choices", choices(numpyro.deterministic("participants", mu + sigma * z)))
 

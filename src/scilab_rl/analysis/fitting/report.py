@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from scilab_rl.analysis.fitting import recovery as recoveries
-from scilab_rl.analysis.fitting.behavior import curve_charts, interval_rows
+from scilab_rl.analysis.fitting.behavior import condition_rows, curve_charts
 from scilab_rl.analysis.fitting.estimation import MAP, Fit, fit
 from scilab_rl.analysis.fitting.panel import Panel
 from scilab_rl.analysis.fitting.predictive import (
@@ -272,7 +272,7 @@ def fit_page(results: FitResults, title: str) -> str:
         models_caption="Smaller AIC and BIC, and larger probabilities of held-out choices, are "
         "better. Frequency: estimated share of participants with the model. PXP: protected "
         "exceedance probability, that it is the most frequent one (Rigoux et al., 2014).",
-        choices=interval_rows(results.behavior),
+        choices=condition_rows(results.behavior),
         choices_caption=f"Means over participants with 95 % intervals; {kind}.",
         curves=curve_charts(results.curves),
         groups=_table(GROUP_COLUMNS, group_rows(results)),

@@ -110,7 +110,7 @@ def test_a_single_one_is_measured_over_blocks():
     one = {name: values[:1] for name, values in TRUE.items()}
     rows = simulate(RESCORLAWAGNER, one, "Bandit", n_trials=20, n_blocks=4)
     group = behavior_group("agent", "an agent", make_panel(rows))
-    assert (group.unit, len(group.panel.participants)) == ("blocks of one", 4)
+    assert (group.unit, len(group.panel.participants)) == ("blocks", 4)
 
 
 @pytest.fixture(scope="module")
@@ -129,7 +129,7 @@ def test_groups_stand_side_by_side(groups):
     assert columns == ["behavior", "people", "model"]
     names = [row["behavior"] for row in rows]
     assert names[:2] == ["after a win", "after a loss"]
-    assert "share of correct choices, trials since the reversal -1" in names
+    assert "correct choices, trials since the reversal -1" in names
     assert len(names) == 2 + 3 + 3
     assert all("[" in str(row["people"]) for row in rows)
 
