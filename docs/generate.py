@@ -5,19 +5,23 @@ They are never stored, so that they cannot be out of date. MkDocs calls `on_file
 
 from __future__ import annotations
 
+import ast
 import contextlib
+import difflib
 import importlib
 import inspect
 import io
 import itertools
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import yaml
 
+from scilab_rl import algorithms
 from scilab_rl.acceptance.agents import CARD_FILE, card_page, read_card
 from scilab_rl.cli.main import COMMANDS, run_command_line
 from scilab_rl.cli.tables import as_typed
@@ -74,7 +78,9 @@ _ELSEWHERE = (
     ),
     (re.compile(r"\]\(\.\./baselines/[^)]+\)"), "](environments.md#all-performance-tests)"),
 )
+_DIFF = re.compile(r"<!-- diff of algorithms: (\w+), (\w+): ([\w, ]+) -->")
 _SECTIONS = ("Args", "Attributes", "Returns", "Raises", "Shapes")
+ALGORITHMS = Path(algorithms.__file__).parent
 _ITEM = re.compile(r"(\*{0,2}[\w, ]+?): (.*)")
 
 
@@ -89,10 +95,59 @@ def on_files(files: Any, config: Any) -> Any:
 
 
 def on_page_markdown(markdown: str, **_: object) -> str:
-    """Let links to files outside of the site lead to their place in it; called by MkDocs."""
+    """Fill in diffs, and let links to outside of the site lead into it; called by MkDocs."""
     for file, place in _ELSEWHERE:
         markdown = file.sub(place, markdown)
-    return markdown
+    return _DIFF.sub(
+        lambda match: "\n".join(diff_page(match[1], match[2], match[3].split(", "))), markdown
+    )
+
+
+def diff_page(old: str, new: str, functions: Sequence[str]) -> Iterator[str]:
+    """Yield some functions of an algorithm's file as they differ from those of another's.
+
+    Args:
+        old: Name of an algorithm, one of ours.
+        new: Name of the one that it is compared with.
+        functions: In the order in which they are shown; one that a file lacks counts as nothing.
+    """
+    lines = list(diff_of(_functions_of(old), _functions_of(new), functions))
+    kept, gone, added = (sum(line[:1] == sign for line in lines) for sign in " -+")
+    yield f"{kept} lines of `{old}` stay, {gone} go (-) and {added} come (+):\n"
+    yield from fenced("diff", "\n".join(lines))
+
+
+def diff_of(
+    old: Mapping[str, list[str]], new: Mapping[str, list[str]], functions: Sequence[str]
+) -> Iterator[str]:
+    """Yield lines that begin with a space (in both), a minus (only in the old) or a plus.
+
+    >>> list(diff_of({"f": ["def f():", "    a"]}, {"f": ["def f():", "    b"]}, ["f"]))
+    [' def f():', '-    a', '+    b', '']
+    """
+    for name in functions:
+        before, after = old.get(name, []), new.get(name, [])
+        matcher = difflib.SequenceMatcher(None, before, after, autojunk=False)
+        for kind, i1, i2, j1, j2 in matcher.get_opcodes():
+            if kind == "equal":
+                yield from (f" {line}" for line in before[i1:i2])
+            else:
+                yield from (f"-{line}" for line in before[i1:i2])
+                yield from (f"+{line}" for line in after[j1:j2])
+        yield ""
+
+
+def _functions_of(algorithm: str) -> dict[str, list[str]]:
+    """Return the lines of each function of an algorithm's file, without docstrings."""
+    text = (ALGORITHMS / f"{algorithm}.py").read_text(encoding="utf-8")
+    lines, found = text.splitlines(), {}
+    for node in ast.parse(text).body:
+        if isinstance(node, ast.FunctionDef):
+            said = node.body[0] if ast.get_docstring(node) else None
+            left_out = range(said.lineno, (said.end_lineno or 0) + 1) if said else ()
+            numbers = range(node.lineno, (node.end_lineno or 0) + 1)
+            found[node.name] = [lines[n - 1] for n in numbers if n not in left_out]
+    return found
 
 
 def keys_page() -> Iterator[str]:

@@ -116,3 +116,18 @@ def test_figures_are_drawn_from_what_is_kept(
     lengths = {len(run) for name in ("with hindsight", "without") for run in kept[name]}
     assert lengths == {len(kept["steps"])}
     assert len(kept["without"]) == len(kept["with hindsight"]) == figures.N_SEEDS
+
+
+def test_a_diff_holds_both_files(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without what is new it is the old file's function, and without what is gone the new one's."""
+    monkeypatch.syspath_prepend(str(ROOT))
+    generate = importlib.import_module("docs.generate")
+    functions = ["soft_targets", "critic_loss", "contrastive_loss", "actor_loss"]
+    old, new = (generate._functions_of(name) for name in ("jaxsac", "jaxcrl"))
+    lines = [line for line in generate.diff_of(old, new, functions) if line]
+    for kept, of in ((" -", old), (" +", new)):
+        shown = [line[1:] for line in lines if line[0] in kept]
+        assert shown == [line for name in functions for line in of.get(name, [])]
+    page = generate.on_page_markdown((ROOT / "docs" / "explain" / "goals.md").read_text("utf-8"))
+    assert "\n+def contrastive_loss(" in page and "\n-def soft_targets(" in page
+    assert "<!-- diff" not in page and "```diff" in page

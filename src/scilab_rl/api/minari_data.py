@@ -10,7 +10,7 @@ import importlib.util
 import os
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from scilab_rl import files
+from scilab_rl.config.schema import RunConfig
 from scilab_rl.envs.types import Observation
 from scilab_rl.envs.vec_step import ObservedStep
 from scilab_rl.envs.vectorize import observed_layer
@@ -28,10 +29,12 @@ from scilab_rl.metrics.success import success_of
 from scilab_rl.run.provenance import recorded_fingerprint
 
 if TYPE_CHECKING:
+    from gymnasium import Space
     from gymnasium.envs.registration import EnvSpec
 
     from scilab_rl.api.agent import Agent, EvaluationSummary
 
+PAGE_FILE = "README.md"
 _FOLDER = "MINARI_DATASETS_PATH"  # the variable by which Minari finds its data sets
 _PACKAGES = ("scilab-rl", "gymnasium", "gymnasium-robotics", "mujoco")
 
@@ -52,6 +55,22 @@ class RecordedEpisode:
     terminated: list[bool] = field(default_factory=list)
     truncated: list[bool] = field(default_factory=list)
     success: list[bool | None] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where episodes are from.
+
+    Attributes:
+        cfg: Names the environment.
+        observation_space, action_space: Those of the environment.
+        policy: A word for who acted.
+    """
+
+    cfg: RunConfig
+    observation_space: Space
+    action_space: Space
+    policy: str
 
 
 class EpisodeCollector:
@@ -82,8 +101,17 @@ class EpisodeCollector:
 
 def default_id(agent: Agent) -> str:
     """Return the id of an agent's data set, such as ``FetchReach/jaxsac-v0``."""
-    name = agent.cfg.env.rpartition(":")[2]
-    return f"{re.sub(r'-v[0-9]+$', '', name)}/{agent.cfg.algorithm.name}-v0".replace(".", "_")
+    return id_of(agent.cfg.env, agent.cfg.algorithm.name)
+
+
+def id_of(env_id: str, name: str) -> str:
+    """Return the id of an environment's data set of this name.
+
+    >>> id_of("FetchPush-v4", "expert")
+    'FetchPush/expert-v0'
+    """
+    family = re.sub(r"-v[0-9]+$", "", env_id.rpartition(":")[2])
+    return f"{family}/{name}-v0".replace(".", "_")
 
 
 def write_minari(
@@ -105,24 +133,59 @@ def write_minari(
         ConfigError: If the id is not one, or there is such a data set already.
         ScilabRLError: If Minari does not read what was written.
     """
-    target = _target(dataset_id)
+    target = claim_id(dataset_id)
     collector, layer = EpisodeCollector(), observed_layer(agent.env)
     layer.observers.append(collector)
     try:
         summary = agent.evaluate(n_episodes, seed=seed)
     finally:
         layer.observers.remove(collector)
-    unfinished = target.parent / f".{target.name}.unfinished"
-    files.discard(unfinished)
-    with _minari_folder(unfinished):
-        _create(agent, dataset_id, collector.episodes, _card(agent, summary, seed))
-        _check(dataset_id, collector.episodes)
-    (unfinished / dataset_id).rename(target)
-    files.discard(unfinished)
+    origin = Origin(
+        agent.cfg, agent.observation_space, agent.action_space, agent.cfg.algorithm.name
+    )
+    write_episodes(target, dataset_id, collector.episodes, origin, _card(agent, summary, seed))
     return target, summary
 
 
-def _target(dataset_id: str) -> Path:
+def write_episodes(
+    target: Path,
+    dataset_id: str,
+    episodes: Sequence[RecordedEpisode],
+    origin: Origin,
+    card: str,
+    page: str | None = None,
+) -> None:
+    """Write a data set, which appears when Minari has read it and each number was compared.
+
+    Args:
+        target: From `claim_id`.
+        dataset_id: Its id.
+        episodes: All of them.
+        origin: Where they are from.
+        card: What the data set's metadata say of it.
+        page: The same in more words, as the file ``README.md``; None: no file.
+
+    Raises:
+        ScilabRLError: If Minari does not read what was written.
+    """
+    unfinished = target.parent / f".{target.name}.unfinished"
+    files.discard(unfinished)
+    with _minari_folder(unfinished):
+        _create(origin, dataset_id, episodes, card)
+        _check(dataset_id, episodes)
+    if page is not None:
+        files.write_text(unfinished / dataset_id / PAGE_FILE, page)
+    (unfinished / dataset_id).rename(target)
+    files.discard(unfinished)
+
+
+def claim_id(dataset_id: str) -> Path:
+    """Return the folder in which Minari looks for a data set, whose id must be free.
+
+    Raises:
+        MissingDependencyError: If Minari is not installed.
+        ConfigError: If the id is not one, or there is such a data set already.
+    """
     if importlib.util.find_spec("minari") is None:
         raise MissingDependencyError("minari", "minari", "to write a Minari data set")
     from minari.dataset.minari_dataset import DATASET_ID_RE
@@ -161,7 +224,9 @@ def _minari_folder(folder: Path) -> Iterator[None]:
             os.environ[_FOLDER] = before
 
 
-def _create(agent: Agent, dataset_id: str, episodes: list[RecordedEpisode], card: str) -> None:
+def _create(
+    origin: Origin, dataset_id: str, episodes: Sequence[RecordedEpisode], card: str
+) -> None:
     import minari
     from minari.data_collector import EpisodeBuffer
 
@@ -181,31 +246,31 @@ def _create(agent: Agent, dataset_id: str, episodes: list[RecordedEpisode], card
         minari.create_dataset_from_buffers(
             dataset_id,
             buffers,
-            env=_recoverable(agent),
-            observation_space=agent.observation_space,
-            action_space=agent.action_space,
-            algorithm_name=agent.cfg.algorithm.name,
+            env=_recoverable(origin),
+            observation_space=origin.observation_space,
+            action_space=origin.action_space,
+            algorithm_name=origin.policy,
             description=card,
             data_format="arrow",
-            requirements=_requirements(),
+            requirements=requirements(),
         )
 
 
-def _recoverable(agent: Agent) -> EnvSpec | None:
+def _recoverable(origin: Origin) -> EnvSpec | None:
     """Return the environment without the run's wrappers; None where they change its spaces."""
     import gymnasium
 
-    env = gymnasium.make(agent.cfg.env, **agent.cfg.env_kwargs)
+    env = gymnasium.make(origin.cfg.env, **origin.cfg.env_kwargs)
     try:
         same = (env.observation_space, env.action_space) == (
-            agent.observation_space, agent.action_space,
+            origin.observation_space, origin.action_space,
         )  # fmt: skip
         return env.spec if same else None
     finally:
         env.close()
 
 
-def _check(dataset_id: str, episodes: list[RecordedEpisode]) -> None:
+def _check(dataset_id: str, episodes: Sequence[RecordedEpisode]) -> None:
     """Read the data set as others will, and compare it with what was recorded."""
     import minari
 
@@ -234,7 +299,8 @@ def _card(agent: Agent, summary: EvaluationSummary, seed: int | None) -> str:
     )
 
 
-def _requirements() -> list[str]:
+def requirements() -> list[str]:
+    """Return the packages that made the episodes, with their versions."""
     found = []
     for package in _PACKAGES:
         with contextlib.suppress(metadata.PackageNotFoundError):

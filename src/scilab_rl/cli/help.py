@@ -45,7 +45,7 @@ _PURPOSES = {
     "Runs": ("runs", "board", "plot", "resume", "note", "tag", "delete"),
     "Compare": ("experiment", "compare", "study", "performance", "fit", "recover"),
     "Change": ("new", "algorithms", "envs", "explain", "profile"),
-    "Data": ("export", "mlflow", "sync"),
+    "Data": ("export", "dataset", "mlflow", "sync"),
 }
 _FIRST_KEYS = (
     "env", "n_epochs", "eval_after_n_steps", "seed", "n_envs", "render", "restore_policy",

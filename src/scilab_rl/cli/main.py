@@ -39,6 +39,7 @@ COMMANDS = {
     "fit": "fit cognitive models to choices and compare them",
     "recover": "simulate and fit: are parameters and models told apart?",
     "export": "write observations, actions and metrics of an agent as a table",
+    "dataset": "write expert, medium, scripted and random data sets of a task",
     "mlflow": "browse the learning curves of all runs with MLflow",
     "sync": "send runs to a tracker that was unavailable while they trained",
     "algorithms": "list the algorithms",
