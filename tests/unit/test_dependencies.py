@@ -26,7 +26,7 @@ MODELS = (
 # Modules that are imported only where their package is known to be installed, or for its users.
 BEHIND_AN_EXTRA = {
     "learning/jax_engine.py", "learning/jax_off_policy.py",
-    "learning/jax_offline.py", "algorithms/jaxcrl.py", "algorithms/jaxgciql.py",
+    "algorithms/jaxcrl.py", "algorithms/jaxgciql.py",
     "algorithms/jaxsac.py", "algorithms/jaxtd3.py", "learning/cognitive.py",
     *(f"algorithms/models/{name}.py" for name in MODELS),
     *(f"analysis/fitting/{name}.py" for name in ("estimation", "hierarchical", "selection")),
