@@ -9,7 +9,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 _BLOCK = re.compile(
-    r"(?P<comments>(?:^[ ]*<!-- (?:test|story): [^\n]* -->\n)*)"
+    r"(?P<comments>(?:^[ ]*<!-- (?:test|story|task): [^\n]* -->\n)*)"
     r"^(?P<indent>[ ]*)```(?P<language>\w+)(?: title=\"(?P<title>[^\"]+)\")?[^\n]*\n"
     r"(?P<text>.*?)^[ ]*```[ ]*$",
     re.MULTILINE | re.DOTALL,
@@ -27,6 +27,7 @@ class Block:
         title: The file to write, if one is named.
         comments: What the ``<!-- test: ... -->`` lines before it say.
         story: What a ``<!-- story: ... -->`` line before it says.
+        task: The one of the six tasks that it belongs to, by a ``<!-- task: ... -->`` line.
     """
 
     line: int
@@ -35,6 +36,7 @@ class Block:
     title: str | None
     comments: tuple[str, ...]
     story: str | None
+    task: str | None
 
     def said(self, word: str) -> str | None:
         """Return what follows a word in the comments; None when none begins with it."""
@@ -67,6 +69,7 @@ def blocks_of(page: Path) -> list[Block]:
             title=match["title"],
             comments=tuple(re.findall(r"<!-- test: (.*?) -->", match["comments"])),
             story=next(iter(re.findall(r"<!-- story: (.*?) -->", match["comments"])), None),
+            task=next(iter(re.findall(r"<!-- task: (.*?) -->", match["comments"])), None),
         )
         for match in _BLOCK.finditer(text)
     ]

@@ -6,11 +6,15 @@ shortened by arguments at the end of each command that trains.
 
 from __future__ import annotations
 
+import csv
+import json
 import re
 import shlex
 import shutil
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import gymnasium
@@ -21,6 +25,7 @@ from scilab_rl.cli.main import COMMANDS, run_command_line
 
 from ..e2e.commands import quiet_environment
 from .pages import DOCS, ROOT, Block, blocks_of, insert_after, pages
+from .test_story import LOOK
 
 SHORT = {
     "n_epochs": "1",
@@ -53,7 +58,7 @@ def executable_pages() -> list[Path]:
 
 
 @pytest.fixture
-def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def project(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """A folder with a fresh copy of the repository's project."""
     listed = subprocess.run(
         ["git", "-c", "safe.directory=*", "ls-files", "conf", "src/custom_*", "src/main.py"],
@@ -84,8 +89,71 @@ def forget_desk() -> None:
 )
 def test_page(page: Path, project: Path) -> None:
     for block in blocks_of(page):
-        if block.language in EXECUTED:
+        if block.language in EXECUTED and block.task is None:
             execute(block, f"{page.relative_to(ROOT)}:{block.line}")
+
+
+def test_six_tasks(project: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Those of a newcomer, one after the other, by the blocks that the pages mark as theirs."""
+    seconds = {}
+    for task, check in TASKS.items():
+        began = time.monotonic()
+        for page, block in [(p, b) for p in pages() for b in blocks_of(p) if b.task == task]:
+            execute(block, f"{page.relative_to(ROOT)}:{block.line}")
+        seconds[task] = round(time.monotonic() - began, 1)
+        check(capsys.readouterr().out)
+    sys.stderr.write(f"6 tasks, {sum(seconds.values()):.0f} s: {json.dumps(seconds, indent=1)}\n")
+
+
+def test_every_task_has_its_check() -> None:
+    assert {block.task for page in pages() for block in blocks_of(page)} == {None, *TASKS}
+
+
+def check_train_and_watch(printed: str) -> None:
+    (run,) = Path("data").glob("*/*FetchReach*")
+    played = run / "episodes" / "play_001.html"
+    assert "goal_distance" in played.read_text() and played.with_suffix(".mp4").is_file()
+    assert re.search(r"success: .*95 % interval", printed)
+
+
+def check_own_curiosity(printed: str) -> None:
+    run = Path("data/last")
+    assert "my_curiosity" in (run / "config.yaml").read_text()
+    assert "intrinsic_reward" in next((run / "episodes").glob("*.html")).read_text()
+    with (run / "trials_step.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 100 and all(float(row["intrinsic_reward"]) > 0 for row in rows)
+
+
+def check_compare_on_3_seeds(printed: str) -> None:
+    (page,) = Path("data/comparisons").glob("*/comparison.json")
+    compared = json.loads(page.read_text())
+    assert [group["seeds"] for group in compared["groups"]] == [[[1, 2, 3]]] * 2
+    assert "3 runs each" in printed
+
+
+def check_own_environment(printed: str) -> None:
+    assert re.search(r"rewards of a batch.*equal on \d+ steps", printed)
+    (run,) = Path("data").glob("*/*MyReach-v0*")
+    assert json.loads((run / "result.json").read_text())["status"] == "finished"
+
+
+def check_data_in_pandas(printed: str) -> None:
+    assert re.search(r"episode\n0 .*\d\n1 .*\d\nName: value", printed)
+
+
+def check_policy_in_a_script(printed: str) -> None:
+    assert printed.strip() in ("True", "1.0")
+
+
+TASKS: dict[str, Callable[[str], None]] = {
+    "train and watch": check_train_and_watch,
+    "own curiosity": check_own_curiosity,
+    "compare on 3 seeds": check_compare_on_3_seeds,
+    "own environment": check_own_environment,
+    "per-step data in pandas": check_data_in_pandas,
+    "policy in an own script": check_policy_in_a_script,
+}
 
 
 def test_commands_of_the_readme(project: Path) -> None:
@@ -171,7 +239,10 @@ def write(block: Block) -> None:
 def type_command(command: str, more: dict[str, str], place: str, *, fails: bool = False) -> None:
     """Run a command line; ours in this process, which spares seconds each."""
     words = shlex.split(command)
-    if words[:2] == ["python", "src/main.py"] or words[0] == "scilab-rl":
+    if words[:2] == ["scilab-rl", "view"] and "--list" not in words:
+        view = [sys.executable, "-c", LOOK, sys.executable, "-m", "scilab_rl.cli.main", *words[1:]]
+        code = subprocess.run(view, env=quiet_environment(DISPLAY=""), check=False).returncode
+    elif words[:2] == ["python", "src/main.py"] or words[0] == "scilab-rl":
         arguments = shortened(words[2 if words[0] == "python" else 1 :], more)
         forget_desk()  # a reader starts a new process
         code = run_command_line(arguments)

@@ -37,10 +37,13 @@ if TYPE_CHECKING:  # heavy
     import pandas
     from stable_baselines3.common.vec_env import VecEnv
 
+    from scilab_rl.canonical_spaces import Conversion
     from scilab_rl.envs.types import Observation
     from scilab_rl.learning.algorithm import Algorithm
     from scilab_rl.learning.inspector import AgentInspector
     from scilab_rl.training.evaluation import Episode, Evaluation
+
+_SAVED = ("best", "finished")
 
 
 def load(
@@ -54,7 +57,8 @@ def load(
     Args:
         run: ``last``, ``agent:NAME`` for a trained agent of the package or the project, the path of
             a run or of a saved policy inside of one, or a part of a run's name.
-        policy: ``best`` or ``finished``, the policy at the end; where there is only one, that.
+        policy: ``best`` or ``finished``, the policy at the end; where there is only one, that. Or
+            the name or path of another one.
         base_logdir: The folder of all runs.
 
     Raises:
@@ -62,12 +66,21 @@ def load(
         CheckpointError: If the policy is damaged.
         MissingDependencyError: If its algorithm or environment needs a package that is missing.
     """
-    open_project()
-    found = find_run(str(run), Path(base_logdir))
-    saved = find_policy(found, str(run), policy, "best", "finished")
-    agent = Agent(found, load_recorded(found / CONFIG_FILE), saved)
+    agent = find(run, policy, base_logdir)
     agent.algorithm  # noqa: B018 - so that what is wrong with it is said here
     return agent
+
+
+def find(run: str | Path, policy: str = "best", base_logdir: str | Path = "data") -> Agent:
+    """Find a trained agent as `load` does; it is loaded when it is used.
+
+    Raises:
+        ConfigError: If there is no such run, agent or policy.
+    """
+    open_project()
+    found = find_run(str(run), Path(base_logdir))
+    names = (str(run), policy, *_SAVED) if policy in _SAVED else (policy,)
+    return Agent(found, load_recorded(found / CONFIG_FILE), find_policy(found, *names))
 
 
 @dataclass(frozen=True)
@@ -152,13 +165,18 @@ class Agent:
         return self._conversions[0].env_space
 
     @property
+    def unseen_seed(self) -> int:
+        """The run's seed plus 1: that of episodes in which it has never been."""
+        return int(self.cfg.seed) + 1
+
+    @property
     def probes(self) -> tuple[str, ...]:
         """The names of what it can be asked with `probe`."""
         return tuple(answerable(self.inspector))
 
     def predict(
         self, observation: Observation, *, deterministic: bool = True, begins: bool = False
-    ) -> Any:
+    ) -> np.ndarray:
         """Return the action for an observation, or one for each of a batch.
 
         Args:
@@ -283,7 +301,7 @@ class Agent:
 
         Args:
             episodes: How many.
-            seed: Of the episodes; None means the run's seed plus 1, which it has never seen.
+            seed: Of the episodes; None means `unseen_seed`.
             deterministic: Whether the most likely action is taken, rather than a sample.
             record: Whether the first episode is recorded.
             metrics: The curves of the recording; None means the most informative ones.
@@ -291,7 +309,7 @@ class Agent:
         """
         from scilab_rl.training.evaluation import evaluate
 
-        seed = int(self.cfg.seed) + 1 if seed is None else seed
+        seed = self.unseen_seed if seed is None else seed
         env, algorithm = load_player(self.cfg, self.policy, record=True) if record else self._player
         finish = self._film(env, algorithm, metrics, seed) if record else None
         prepare_torch(self.cfg)
@@ -316,7 +334,7 @@ class Agent:
 
         Args:
             metrics: Names of probes to draw; None means the most informative ones.
-            seed: Of the episode; None means the run's seed plus 1.
+            seed: Of the episode; None means `unseen_seed`.
         """
         replay = self.evaluate(1, seed=seed, record=True, metrics=metrics).replay
         assert replay is not None
@@ -338,7 +356,7 @@ class Agent:
         Args:
             episodes: How many.
             per: What a row is: a step or an episode.
-            seed: Of the episodes; None means the run's seed plus 1.
+            seed: Of the episodes; None means `unseen_seed`.
             softmax: Choose with probability proportional to exp(softmax Q), as a simulated
                 participant; None means the most likely action.
             sample: Whether actions are drawn from the policy. Those of cognitive models always are.
@@ -349,7 +367,7 @@ class Agent:
         """
         from scilab_rl.training.trajectory_table import by_episode, collect, softmax_choice
 
-        seed = int(self.cfg.seed) + 1 if seed is None else seed
+        seed = self.unseen_seed if seed is None else seed
         prepare_torch(self.cfg)
         choose = None if softmax is None else softmax_choice(self.algorithm, softmax, seed)
         seed_everything(seed)
@@ -414,12 +432,12 @@ class Agent:
         return load_player(self.cfg, self.policy, record=False)
 
     @functools.cached_property
-    def _conversions(self) -> tuple[Any, Any]:
+    def _conversions(self) -> tuple[Conversion, Conversion]:
         from scilab_rl.canonical_spaces import conversions
 
         return conversions(self.env)
 
-    def _as_batch(self, observation: Observation) -> tuple[Any, bool]:
+    def _as_batch(self, observation: Observation) -> tuple[Observation, bool]:
         """Return the observation as a batch, and whether it was a single one."""
         if self.inspector.reason:
             raise ConfigError(self.inspector.reason)
@@ -460,7 +478,7 @@ class Agent:
         return finish
 
 
-def as_batch(observation: Observation, space: Any) -> tuple[Any, bool]:
+def as_batch(observation: Observation, space: gymnasium.Space) -> tuple[Observation, bool]:
     """Return an observation as a batch of the space's type, and whether it was a single one.
 
     Raises:
@@ -482,15 +500,14 @@ def as_batch(observation: Observation, space: Any) -> tuple[Any, bool]:
     return {key: batch for key, (batch, _) in found.items()}, kinds.pop()
 
 
-def _array_batch(value: Any, space: Any, name: str) -> tuple[np.ndarray, bool]:
-    array = np.asarray(value, dtype=space.dtype)
-    if array.shape == space.shape:
+def _array_batch(value: object, space: gymnasium.Space, name: str) -> tuple[np.ndarray, bool]:
+    array, shape = np.asarray(value, dtype=space.dtype), space.shape or ()
+    if array.shape == shape:
         return array[None], True
-    if array.shape[1:] == space.shape and array.ndim:
+    if array.shape[1:] == shape and array.ndim:
         return array, False
     raise ConfigError(
-        f"{name} has the shape {array.shape}, but the agent reads {space.shape}, or "
-        f"{('batch', *space.shape)}."
+        f"{name} has the shape {array.shape}, but the agent reads {shape}, or {('batch', *shape)}."
     )
 
 

@@ -17,12 +17,12 @@ from scilab_rl.analysis.fitting.predictive import simulated_panel, size_of
 from scilab_rl.analysis.fitting.simulation import make_task
 from scilab_rl.analysis.fitting.words import MODEL, TABLES, split_label
 from scilab_rl.analysis.groups import RunRecord, find_group, read_records
-from scilab_rl.api.agent import Agent
+from scilab_rl.api.agent import find
 from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.workspace import config_files, open_project
 from scilab_rl.envs.registration import resolve_env_id
 from scilab_rl.errors import ConfigError
-from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy
+from scilab_rl.run.directory import CONFIG_FILE
 
 N_SIMULATED = 20  # participants with the parameters of a model's YAML
 
@@ -119,11 +119,9 @@ def _ask_agents(label: str, word: str, settings: BehaviorSettings, base: Path) -
 
 
 def _act(record: RunRecord, settings: BehaviorSettings) -> Iterable[dict[str, Any]]:
-    run = RunDirectory(record.path)
-    policy = find_policy(run, "finished", "best")
-    with Agent(run, load_recorded(run / CONFIG_FILE), policy) as agent:
+    with find(record.path, "finished") as agent:
         rows = agent.trajectories(settings.n_episodes, softmax=settings.softmax)
-    return [{"participant_id": run.path.name, "env": record.env, **row} for row in rows]
+    return [{"participant_id": record.path.name, "env": record.env, **row} for row in rows]
 
 
 def _only_task(found: Sequence[_Choices], env: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
@@ -17,11 +17,12 @@ from scilab_rl.api.run import Run
 from scilab_rl.api.shown import in_frame
 from scilab_rl.api.tables import as_table
 from scilab_rl.errors import ConfigError
+from scilab_rl.run.facts import matches_name
 
 if TYPE_CHECKING:  # heavy
     import pandas
 
-Runs: TypeAlias = str | Run | Sequence[Run]
+Runs: TypeAlias = str | Run | Sequence[Run] | Group
 
 
 @dataclass(frozen=True, repr=False)
@@ -57,13 +58,17 @@ class ComparisonSummary:
         """
         return as_table(contrast_rows(self.comparison))
 
-    def save(self, folder: str | Path) -> list[Path]:
-        """Write page, pictures and tables, and return their paths.
+    def save(self, folder: str | Path, *, parquet: bool = False) -> list[Path]:
+        """Write page, pictures and tables, and return their paths, that of the page first.
 
         Args:
             folder: Created if missing.
+            parquet: Whether the table of runs is also written as Parquet.
+
+        Raises:
+            MissingDependencyError: If Parquet is requested and pyarrow is not installed.
         """
-        return write_reports(self.comparison, Path(folder))
+        return write_reports(self.comparison, Path(folder), parquet=parquet)
 
     def __repr__(self) -> str:
         return f"<ComparisonSummary of {', '.join(g.label for g in self.comparison.groups)}>"
@@ -79,6 +84,7 @@ class ComparisonSummary:
 
 def compare(
     *groups: Runs | Mapping[str, Runs],
+    env: str | None = None,
     metric: str | None = None,
     score: str = "final",
     threshold: float = 0.9,
@@ -90,6 +96,7 @@ def compare(
         groups: Each a word as the command line takes it (an algorithm, a group, a tag, a study, a
             run, or a pattern), a run, or runs. One mapping gives them labels:
             ``{"sparse": runs, "dense": others}``.
+        env: Only the runs in this environment, with or without version; ``*`` stands for any text.
         metric: None means success where all runs have it, else the mean reward.
         score: ``final``, ``auc`` or ``steps_to_threshold``.
         threshold: For the steps.
@@ -100,7 +107,7 @@ def compare(
     """
     named = [pair for group in groups for pair in _named(group)]
     if len(named) < 2:
-        raise ConfigError('compare requires two groups, as in compare("sac", "cleansac").')
+        raise ConfigError("compare requires two groups, for example sac and cleansac.")
     base = Path(base_logdir)
     records = functools.cache(lambda: read_records(base))
     found = [
@@ -109,6 +116,8 @@ def compare(
         else _group(label, runs)
         for label, runs in named
     ]
+    if env is not None:
+        found = [_only(group, env) for group in found]
     return ComparisonSummary(compare_groups(found, ComparisonSettings(metric, score, threshold)))
 
 
@@ -116,7 +125,16 @@ def _named(group: Runs | Mapping[str, Runs]) -> list[tuple[str, Runs]]:
     return list(group.items()) if isinstance(group, Mapping) else [("", group)]
 
 
-def _group(label: str, runs: Run | Sequence[Run]) -> Group:
+def _only(group: Group, env: str) -> Group:
+    runs = tuple(run for run in group.runs if matches_name(run.env, env))
+    if not runs:
+        raise ConfigError(f"{group.label} has no run in {env}.")
+    return replace(group, runs=runs)
+
+
+def _group(label: str, runs: Run | Sequence[Run] | Group) -> Group:
+    if isinstance(runs, Group):
+        return replace(runs, label=label or runs.label)
     listed = [runs] if isinstance(runs, Run) else list(runs)
     records = tuple(_record(run) for run in listed)
     names = label or " and ".join(dict.fromkeys(record.algorithm for record in records))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 from scilab_rl.analysis.estimates import Estimate
 from scilab_rl.analysis.goal_report import GoalReport, examine
 from scilab_rl.analysis.goals import GoalSettings
-from scilab_rl.api.agent import Agent, load
+from scilab_rl.api.agent import Agent, find
 from scilab_rl.api.isolation import isolated
 from scilab_rl.api.shown import Page
 from scilab_rl.api.tables import as_table
@@ -64,7 +64,15 @@ class GoalSummary(Page):
         )  # fmt: skip
 
     def __str__(self) -> str:
-        return "\n".join([f"success over the goal space: {self.success}", *self.findings])
+        study = self.report.study
+        lines = [
+            f"success over the goal space: {self.success}, {study.settings.episodes} episodes "
+            "per goal",
+            f"with the goals that are asked for: {study.own}",
+        ]
+        if study.calibration is not None:
+            lines.append(f"AUC of the value as a predictor of success: {study.calibration.auc}")
+        return "\n".join([*lines, *(f"* {finding}" for finding in self.findings)])
 
 
 @isolated()
@@ -77,6 +85,7 @@ def goals(
     seed: int = 1,
     checkpoints: Sequence[str] = (),
     record: int = 3,
+    progress: Callable[[int, int], None] | None = None,
 ) -> GoalSummary:
     """Map where in its goal space an agent succeeds; the same as ``scilab-rl goals``.
 
@@ -86,16 +95,27 @@ def goals(
         episodes: Of each cell.
         axes: Dimensions of the goal; None: the free ones.
         seed: Of all chance.
-        checkpoints: Saved policies whose values are shown too, as ``best``.
+        checkpoints: Saved policies whose values are shown too, as ``best``; ``["all"]``: all.
         record: How many failed episodes are recorded.
+        progress: Called after each episode: how many are done, and of how many.
 
     Raises:
         ConfigError: If the environment has no goals, or they cannot be chosen.
     """
-    agent = load(agent) if isinstance(agent, str) else agent
+    agent = find(agent) if isinstance(agent, str) else agent
     chosen = [None if numbers is None else tuple(numbers) for numbers in (cells, axes)]
     settings = GoalSettings(chosen[0], episodes, chosen[1], seed)
-    saved = [find_policy(agent.run, name) for name in checkpoints]
+    if list(checkpoints) == ["all"]:
+        saved = sorted(agent.run.path.glob("rl_model_*"))
+    else:
+        saved = [find_policy(agent.run, name) for name in checkpoints]
     return GoalSummary(
-        examine(agent.run, agent.policy, settings, checkpoints=saved, n_recorded=record)
+        examine(
+            agent.run,
+            agent.policy,
+            settings,
+            checkpoints=saved,
+            n_recorded=record,
+            progress=progress,
+        )
     )

@@ -294,7 +294,7 @@ def _card(agent: Agent, summary: EvaluationSummary, seed: int | None) -> str:
     return (
         f"{summary.n_episodes} episodes of {agent.cfg.algorithm.name} in {agent.cfg.env}, by its "
         f"most likely actions: {summary}. Run {agent.run}, policy {agent.policy.name}, seed "
-        f"{int(agent.cfg.seed) + 1 if seed is None else seed} of the episodes. Fingerprint of the "
+        f"{agent.unseen_seed if seed is None else seed} of the episodes. Fingerprint of the "
         f"environment: {fingerprint}. Written by Scilab-RL."
     )
 

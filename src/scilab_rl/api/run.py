@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
-from scilab_rl import files, telemetry
+from scilab_rl import telemetry
 from scilab_rl.api.agent import Agent, load
 from scilab_rl.api.isolation import isolated, messages
 from scilab_rl.api.shown import Figure, Replay, in_notebook, table_html
@@ -18,7 +18,7 @@ from scilab_rl.config.overrides import as_override
 from scilab_rl.config.workspace import open_project
 from scilab_rl.errors import ConfigError, did_you_mean, listing
 from scilab_rl.results import RunResult
-from scilab_rl.run.directory import RunDirectory, all_runs, find_run, read_epochs
+from scilab_rl.run.directory import RunDirectory, all_runs, find_run, read_episodes, read_epochs
 from scilab_rl.run.facts import matches_name, read_run
 from scilab_rl.run.recordings import chosen_recordings, has_recordings
 from scilab_rl.run.run import start_run
@@ -185,7 +185,8 @@ class Run:
     @property
     def epochs(self) -> list[dict[str, float]]:
         """The metrics of each epoch, the oldest first; `metrics` is the same as a table."""
-        return [_without_kind(row) for row in read_epochs(self.directory)]
+        epochs = read_epochs(self.directory)
+        return [{name: row[name] for name in row if name != "kind"} for row in epochs]
 
     @property
     def metrics(self) -> pandas.DataFrame:
@@ -203,8 +204,7 @@ class Run:
         Raises:
             MissingDependencyError: If pandas is not installed.
         """
-        rows = files.read_json_lines(self.path / "metrics.jsonl")
-        return as_table([_without_kind(row) for row in rows if row.get("kind") == "episode"])
+        return as_table(read_episodes(self.directory))
 
     def agent(self, policy: str = "best") -> Agent:
         """Load its trained agent; see `load`."""
@@ -257,7 +257,3 @@ class Run:
         return Figure.of_curves(
             {name: [(row["step"], row[name]) for row in rows if name in row] for name in metrics}
         )
-
-
-def _without_kind(row: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in row.items() if key != "kind"}

@@ -6,7 +6,6 @@ With tables of choices or models among the groups, behavior is compared: see `co
 from __future__ import annotations
 
 import argparse
-import functools
 import logging
 from collections.abc import Sequence
 from pathlib import Path
@@ -16,14 +15,11 @@ from scilab_rl.analysis.fitting.words import names_choices
 from scilab_rl.cli import compare_behavior
 from scilab_rl.cli.parser import CommandParser
 from scilab_rl.cli.tables import print_json, print_rows, write
-from scilab_rl.errors import ConfigError
-from scilab_rl.run.directory import slug
 
 if TYPE_CHECKING:  # heavy
     from scilab_rl.analysis.groups import Group
 
 _log = logging.getLogger(__name__)
-FOLDER = "comparisons"
 
 
 def main(arguments: list[str]) -> int:
@@ -32,52 +28,46 @@ def main(arguments: list[str]) -> int:
     if any(map(names_choices, options.groups)):
         compare_behavior.show_behavior(options)
         return 0
-    from scilab_rl.analysis.groups import find_group, read_records
-
-    if len(options.groups) < 2:
-        raise ConfigError("compare requires at least two groups, for example: compare sac sac_var")
-    base = options.base_logdir
-    records = functools.cache(lambda: read_records(base))
-    groups = [find_group(word, records, base) for word in options.groups]
-    show(groups, options)
+    show(options.groups, options)
     return 0
 
 
-def show(groups: Sequence[Group], options: argparse.Namespace) -> None:
+def show(groups: Sequence[str | Group], options: argparse.Namespace) -> None:
     """Compare groups of runs, write the reports and print the tables.
 
     Args:
         groups: At least two.
         options: With the options that `add_options` adds.
     """
-    from scilab_rl.analysis.comparison import ComparisonSettings, compare
     from scilab_rl.analysis.report import (
         CONTRAST_COLUMNS,
         GROUP_COLUMNS,
         as_json,
-        conclusion,
         contrast_rows,
         group_rows,
-        write_reports,
     )
+    from scilab_rl.api.comparison import compare
 
-    if options.env:
-        groups = [_only(group, options.env) for group in groups]
-    comparison = compare(
-        groups, ComparisonSettings(options.metric, options.score, options.threshold)
+    summary = compare(
+        *groups,
+        env=options.env,
+        metric=options.metric,
+        score=options.score,
+        threshold=options.threshold,
+        base_logdir=options.base_logdir,
     )
+    comparison = summary.comparison
     for note in comparison.notes:
         _log.warning("%s", note)
-    name = slug("-vs-".join(group.label for group in groups))
-    folder = options.output or options.base_logdir / FOLDER / name
-    paths = write_reports(comparison, folder, parquet=options.parquet)
+    folder = compare_behavior.report_folder((g.label for g in comparison.groups), options)
+    paths = summary.save(folder, parquet=options.parquet)
     if options.json:
         print_json(as_json(comparison))
     else:
         print_rows(GROUP_COLUMNS, group_rows(comparison), optional=("crashed", "median", "reached"))
         print_rows(CONTRAST_COLUMNS, contrast_rows(comparison), optional=("pairs", "p"))
-        for contrast in comparison.contrasts:
-            write(conclusion(comparison, contrast))
+        for line in summary.conclusions:
+            write(line)
     _log.info("%s", paths[0])
 
 
@@ -92,22 +82,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="one number per run; default: final, the mean of its last three evaluations",
     )
     add("--threshold", type=float, default=0.9, help="of steps_to_threshold; default: 0.9")
-    add("--env", help="only this environment; without version: any version")
+    add("--env", help="only this environment; without version: any version; * stands for any text")
     add("--output", type=Path, metavar="DIR", help="of the reports; default: data/comparisons")
     add("--parquet", action="store_true", help="also write the table of runs as Parquet")
-
-
-def _only(group: Group, env: str) -> Group:
-    import dataclasses
-    import re
-
-    def family(name: str) -> str:
-        return re.sub(r"-v\d+$", "", name)
-
-    runs = tuple(run for run in group.runs if env in (run.env, family(run.env)))
-    if not runs:
-        raise ConfigError(f"{group.label} has no run in {env}.")
-    return dataclasses.replace(group, runs=runs)
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:

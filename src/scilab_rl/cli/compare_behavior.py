@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
+from collections.abc import Iterable
+from pathlib import Path
 
 from scilab_rl.cli.fit import env_kwargs_of, require_jax
 from scilab_rl.cli.parser import positive
@@ -24,6 +26,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="agents choose with probability proportional to exp(BETA Q)",
     )
     add("--seed", type=int, default=0, help="of fitted and simulated models")
+
+
+def report_folder(labels: Iterable[str], options: argparse.Namespace) -> Path:
+    """Return the folder that gets the page of a comparison."""
+    return options.output or options.base_logdir / "comparisons" / slug("-vs-".join(labels))
 
 
 def show_behavior(options: argparse.Namespace) -> None:
@@ -47,9 +54,7 @@ def show_behavior(options: argparse.Namespace) -> None:
         ),
         options.base_logdir,
     )
-    name = slug("-vs-".join(group.label for group in groups))
-    folder = options.output or options.base_logdir / "comparisons" / name
-    page = write_behavior(groups, task, folder)
+    page = write_behavior(groups, task, report_folder((group.label for group in groups), options))
     if options.json:
         print_json({"env": task, "behavior": behavior_rows(groups)})
     else:

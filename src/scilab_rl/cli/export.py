@@ -7,13 +7,11 @@ import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from scilab_rl import files
 from scilab_rl.cli.parser import CommandParser, positive
 from scilab_rl.config.recorded import load_recorded
-from scilab_rl.config.schema import RunConfig
 from scilab_rl.config.workspace import PROJECT_AGENTS, open_project
 from scilab_rl.errors import ConfigError
-from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run
+from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run, read_episodes
 
 SAVED = ("best", "finished")
 _log = logging.getLogger(__name__)
@@ -31,9 +29,9 @@ def main(arguments: list[str]) -> int:
     if options.policy:
         return _policy(run, options)
     if options.minari is not None:
-        return _minari(run, options)
+        return _minari(options)
     cfg = load_recorded(run / CONFIG_FILE)
-    rows = _training_episodes(run) if options.training else _trials(run, cfg, options)
+    rows = _training_episodes(run) if options.training else _trials(options)
     origin = {
         "run": run.path.name,
         "env": cfg.env,
@@ -94,13 +92,12 @@ def _policy(run: RunDirectory, options: argparse.Namespace) -> int:
     return 0
 
 
-def _minari(run: RunDirectory, options: argparse.Namespace) -> int:
+def _minari(options: argparse.Namespace) -> int:
     """Write episodes as a data set for offline learning."""
-    from scilab_rl.api.agent import Agent
+    from scilab_rl.api.agent import find
     from scilab_rl.api.minari_data import default_id, write_minari
 
-    policy = find_policy(run, options.run, options.saved, "best", "finished")
-    with Agent(run, load_recorded(run / CONFIG_FILE), policy) as agent:
+    with find(options.run, options.saved, options.base_logdir) as agent:
         dataset_id = options.minari or default_id(agent)
         folder, summary = write_minari(
             agent, dataset_id, options.episodes or 100, seed=options.seed or None
@@ -110,13 +107,10 @@ def _minari(run: RunDirectory, options: argparse.Namespace) -> int:
     return 0
 
 
-def _trials(
-    run: RunDirectory, cfg: RunConfig, options: argparse.Namespace
-) -> Sequence[Mapping[str, object]]:
-    from scilab_rl.api.agent import Agent
+def _trials(options: argparse.Namespace) -> Sequence[Mapping[str, object]]:
+    from scilab_rl.api.agent import find
 
-    policy = find_policy(run, options.run, options.saved, "best", "finished")
-    with Agent(run, cfg, policy) as agent:
+    with find(options.run, options.saved, options.base_logdir) as agent:
         return agent.trajectories(
             options.episodes or 20,
             per=options.per,
@@ -131,8 +125,7 @@ def _training_episodes(run: RunDirectory) -> Sequence[Mapping[str, object]]:
     """Return the training episodes, as the run has recorded them."""
     from scilab_rl.training.trajectory_table import fill_silent_outcomes
 
-    rows = files.read_json_lines(run / "metrics.jsonl")
-    rows = [row for row in rows if row.pop("kind", None) == "episode"]
+    rows = read_episodes(run)
     if not rows:
         raise ConfigError(f"The run '{run}' has no training episode yet.")
     fill_silent_outcomes(rows)

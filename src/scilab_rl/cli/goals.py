@@ -4,12 +4,9 @@ from __future__ import annotations
 
 import argparse
 import logging
-from pathlib import Path
 
 from scilab_rl.cli.parser import CommandParser, positive
 from scilab_rl.cli.tables import write
-from scilab_rl.config.workspace import open_project
-from scilab_rl.run.directory import RunDirectory, find_policy, find_run
 
 _log = logging.getLogger(__name__)
 
@@ -17,40 +14,27 @@ _log = logging.getLogger(__name__)
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     options = _parse(arguments)
-    open_project()
-    from scilab_rl.analysis.goal_report import examine
-    from scilab_rl.analysis.goals import GoalSettings
+    from scilab_rl.api.agent import find
+    from scilab_rl.api.goals import goals
 
-    run = find_run(options.run, options.base_logdir)
-    policy = find_policy(run, options.run, options.policy, "best", "finished")
-    report = examine(
-        run,
-        policy,
-        GoalSettings(options.cells, options.episodes, options.axes, options.seed),
-        checkpoints=_checkpoints(run, options.checkpoint),
-        n_recorded=options.record,
+    summary = goals(
+        find(options.run, options.policy, options.base_logdir),
+        cells=options.cells,
+        episodes=options.episodes,
+        axes=options.axes,
+        seed=options.seed,
+        checkpoints=options.checkpoint,
+        record=options.record,
         progress=_tell,
     )
-    study = report.study
-    write(f"success over the goal space: {study.overall}, {options.episodes} episodes per goal")
-    write(f"with the goals that are asked for: {study.own}")
-    if study.calibration is not None:
-        write(f"AUC of the value as a predictor of success: {study.calibration.auc}")
-    for finding in study.findings:
-        write(f"* {finding}")
-    _log.info("%s", report.page)
+    write(str(summary))
+    _log.info("%s", summary.path)
     return 0
 
 
 def _tell(done: int, n: int) -> None:
     if done % max(1, n // 5) == 0 and n >= 100:
         _log.info("%d of %d episodes", done, n)
-
-
-def _checkpoints(run: RunDirectory, names: list[str]) -> list[Path]:
-    if names == ["all"]:
-        return sorted(run.path.glob("rl_model_*"))
-    return [find_policy(run, name) for name in names]
 
 
 def _parse(arguments: list[str]) -> argparse.Namespace:

@@ -9,14 +9,13 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scilab_rl.api.agent import Agent, EvaluationSummary
+from scilab_rl.api.agent import Agent, EvaluationSummary, find
 from scilab_rl.cli.parser import CommandParser, positive
-from scilab_rl.config.recorded import load_recorded
 from scilab_rl.config.schema import RunConfig
 from scilab_rl.config.workspace import open_project
 from scilab_rl.errors import ConfigError
 from scilab_rl.files import shown
-from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, all_agents, find_policy, find_run
+from scilab_rl.run.directory import RunDirectory, all_agents
 
 if TYPE_CHECKING:  # heavy
     from scilab_rl.training.evaluation import Episode
@@ -27,9 +26,8 @@ _log = logging.getLogger(__name__)
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     options = _parse(arguments)
-    open_project()
-    run, cfg, policy = _find(options)
-    with Agent(run, replace(cfg, render_view=options.view or cfg.render_view), policy) as agent:
+    with _find(options) as agent:
+        agent.cfg = replace(agent.cfg, render_view=options.view or agent.cfg.render_view)
         summary = agent.evaluate(
             options.episodes,
             seed=options.seed or None,
@@ -42,8 +40,8 @@ def main(arguments: list[str]) -> int:
     return 0
 
 
-def _find(options: argparse.Namespace) -> tuple[RunDirectory, RunConfig, Path]:
-    """Return the run, its configuration and the saved policy to play.
+def _find(options: argparse.Namespace) -> Agent:
+    """Return the agent to play.
 
     A zip of Stable-Baselines3 has no run; its algorithm and environment are on the command line.
 
@@ -55,15 +53,15 @@ def _find(options: argparse.Namespace) -> tuple[RunDirectory, RunConfig, Path]:
     archive = sb3_archives.find_archive(Path(options.run))
     if archive is not None:
         sb3_archives.refuse_untrusted(archive)
-        return RunDirectory(archive.parent), _composed_for(archive, options.overrides), archive
+        open_project()
+        cfg = _composed_for(archive, options.overrides)
+        return Agent(RunDirectory(archive.parent), cfg, archive)
     if options.overrides:
         raise ConfigError(
             f"'{options.overrides[0]}' applies only to zips of Stable-Baselines3; a run keeps "
             "its configuration."
         )
-    run = find_run(options.run, options.base_logdir)
-    policy = find_policy(run, options.run, options.policy, "best", "finished")
-    return run, load_recorded(run / CONFIG_FILE), policy
+    return find(options.run, options.policy, options.base_logdir)
 
 
 def _composed_for(archive: Path, overrides: list[str]) -> RunConfig:

@@ -8,16 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from scilab_rl.api.agent import Agent
+from scilab_rl.api.agent import Agent, find
 from scilab_rl.cli.parser import CommandParser, positive
-from scilab_rl.cli.view import chosen_recordings
-from scilab_rl.config.recorded import load_recorded
-from scilab_rl.config.workspace import open_project
 from scilab_rl.errors import ConfigError
 from scilab_rl.files import shown
-from scilab_rl.recording.records import FOLDER as EPISODES
-from scilab_rl.recording.records import SUFFIX
-from scilab_rl.run.directory import CONFIG_FILE, RunDirectory, find_policy, find_run, slug
+from scilab_rl.run.directory import slug
+from scilab_rl.run.recordings import chosen_recordings, has_recordings
 
 _log = logging.getLogger(__name__)
 _MOST_SEEDS = 200
@@ -27,14 +23,11 @@ FOLDER = "whatif"
 def main(arguments: list[str]) -> int:
     """Run the command and return its exit code."""
     options = _parse(arguments)
-    open_project()
     from scilab_rl.analysis.whatif import Change
     from scilab_rl.analysis.whatif_page import verdict
     from scilab_rl.analysis.whatif_report import ask, write_report
 
-    run = find_run(options.run, options.base_logdir)
-    wanted = [options.checkpoint] if options.checkpoint else ["finished", "best"]
-    agent = Agent(run, load_recorded(run / CONFIG_FILE), find_policy(run, *wanted))
+    agent = find(options.run, options.checkpoint or "finished", options.base_logdir)
     recording = _recording(agent, options)
     report = ask(
         agent.cfg,
@@ -46,7 +39,7 @@ def main(arguments: list[str]) -> int:
         every=options.every,
         question=_question(options),
     )
-    page = run.outputs / FOLDER / f"{recording.stem}_{_name(options)}.html"
+    page = agent.run.outputs / FOLDER / f"{recording.stem}_{_name(options)}.html"
     write_report(report, page)
     _log.info("%s", verdict(report))
     _log.info("%s", shown(page))
@@ -56,12 +49,12 @@ def main(arguments: list[str]) -> int:
 def _recording(agent: Agent, options: argparse.Namespace) -> Path:
     """Return the recording that is asked for; record an episode where there is none."""
     is_new = options.seed is not None or options.failed
-    if not is_new and (options.episode or _has_recordings(agent.run)):
+    if not is_new and (options.episode or has_recordings(agent.run)):
         return chosen_recordings(agent.run, options.episode or "last")[-1]
     if options.checkpoint:  # the episode is that of the run's own policy
-        agent = Agent(agent.run, agent.cfg, find_policy(agent.run, "finished", "best"))
+        agent = find(options.run, "finished", options.base_logdir)
     with agent:
-        seed = int(agent.cfg.seed) + 1 if options.seed is None else options.seed
+        seed = agent.unseen_seed if options.seed is None else options.seed
         seed = _failing_seed(agent, seed) if options.failed else seed
         _log.info("Recording an episode with seed %d ...", seed)
         return agent.record(seed=seed).recording
@@ -77,10 +70,6 @@ def _failing_seed(agent: Agent, first: int) -> int:
         f"None of {_MOST_SEEDS} episodes fails (seeds {first} to {first + _MOST_SEEDS - 1}); "
         "--seed N records one that succeeds."
     )
-
-
-def _has_recordings(run: RunDirectory) -> bool:
-    return any((run.outputs / EPISODES).glob(f"*{SUFFIX}"))
 
 
 def _question(options: argparse.Namespace) -> str:

@@ -210,7 +210,7 @@ def find_policy(run: RunDirectory, *names: str) -> Path:
             return archive  # of Stable-Baselines3; whoever loads it asks whether it is trusted
     if not saved:
         raise ConfigError(f"The run '{run}' has not saved a policy yet: it needs one epoch.")
-    raise ConfigError(f"There is no policy '{names[0]}'. The run has: {', '.join(sorted(saved))}.")
+    raise ConfigError(f"There is no policy '{names[-1]}'. The run has: {', '.join(sorted(saved))}.")
 
 
 def policy_path(name: str) -> Path:
@@ -324,3 +324,9 @@ def read_epochs(run: RunDirectory) -> list[dict[str, Any]]:
     """Return the rows of ``metrics.jsonl`` that describe evaluations, oldest first."""
     rows = files.read_json_lines(run / "metrics.jsonl", containing='"epoch"')
     return [row for row in rows if row.get("kind") == "epoch"]
+
+
+def read_episodes(run: RunDirectory) -> list[dict[str, Any]]:
+    """Return the training episodes in ``metrics.jsonl``, oldest first."""
+    rows = files.read_json_lines(run / "metrics.jsonl", containing='"episode"')
+    return [row for row in rows if row.pop("kind", None) == "episode"]

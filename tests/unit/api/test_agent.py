@@ -12,6 +12,7 @@ import torch
 
 import scilab_rl
 from scilab_rl.analysis.estimates import success_interval
+from scilab_rl.analysis.goals import GoalSettings
 from scilab_rl.api.agent import as_batch
 from scilab_rl.config.compose import compose
 from scilab_rl.errors import ConfigError
@@ -194,13 +195,19 @@ def test_what_is_not_there(name: str, tmp_path: Path) -> None:
         scilab_rl.load(name, base_logdir=tmp_path)
 
 
+def test_a_misspelled_policy_is_not_replaced(reach: scilab_rl.Agent) -> None:
+    with pytest.raises(ConfigError, match="There is no policy 'finisht'"):
+        scilab_rl.load(reach.run.path, policy="finisht")
+
+
 def test_goals_are_mapped(reach: scilab_rl.Agent, tmp_path: Path, monkeypatch) -> None:
     """What `examine` finds is tested with it; here is what becomes of it."""
     given = {}
     study = SimpleNamespace(
         space=SimpleNamespace(axes=(0,)), grid=SimpleNamespace(centers=[[-0.5], [0.5]]),
         rates=[success_interval(4, 4), success_interval(1, 4)], asked=np.array([7, 0]),
-        overall=success_interval(5, 8), findings=["not reached: the right."],
+        overall=success_interval(5, 8), own=success_interval(4, 4), calibration=None,
+        findings=["not reached: the right."], settings=GoalSettings(episodes=4),
     )  # fmt: skip
 
     def examine(run, policy, settings, **more):
@@ -213,7 +220,8 @@ def test_goals_are_mapped(reach: scilab_rl.Agent, tmp_path: Path, monkeypatch) -
     assert given["settings"].cells == (2,) and given["n_recorded"] == 1
     assert given["checkpoints"] == [reach.policy]
     assert str(found).splitlines() == [
-        "success over the goal space: 0.625 [0.306, 0.863]", "not reached: the right.",
+        "success over the goal space: 0.625 [0.306, 0.863], 4 episodes per goal",
+        "with the goals that are asked for: 1 [0.51, 1]", "* not reached: the right.",
     ]  # fmt: skip
     assert "&lt;p&gt;Goals" in found._repr_html_()
     pytest.importorskip("pandas")

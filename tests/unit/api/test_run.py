@@ -104,6 +104,10 @@ def test_a_comparison_is_shown_as_a_page(run: scilab_rl.Run, tmp_path: Path) -> 
     assert (tmp_path / "comparison.html") in comparison.save(tmp_path)
     same = scilab_rl.compare(run, f"other={other.path.name}", metric="eval/mean_reward")
     assert [group.label for group in same.comparison.groups] == ["random", "other"]
+    reach = scilab_rl.compare(run, other, env="*tinyreach", metric="eval/mean_reward")
+    assert [group.n_runs for group in reach.comparison.groups] == [1, 1]
+    with pytest.raises(ConfigError, match="has no run in FetchReach"):
+        scilab_rl.compare(run, other, env="FetchReach")
     with pytest.raises(ConfigError, match="requires two groups"):
         scilab_rl.compare(run)
 
