@@ -14,10 +14,13 @@ import re
 import sys
 from pathlib import Path
 
+import aiohttp
 import numpy as np
 import stan
 
 N_CHAINS = 4
+# PyStan waits for its own compiler as for a web page, and on a busy machine not long enough.
+aiohttp.client.DEFAULT_TIMEOUT = aiohttp.ClientTimeout(total=None)
 # real y[N, T];  ->  array[N, T] real y;
 OLD_ARRAY = re.compile(r"(?m)^(\s*)((?:int|real)(?:<[^>]*>)?)\s+(\w+)\[([^\]]*)\];")
 OLD_MODULUS = re.compile(r"modulus\((level2_choice\[i, ?t\]), 2\)")
