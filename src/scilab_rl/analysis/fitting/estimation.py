@@ -1,14 +1,14 @@
 """Parameters of each participant: maximum likelihood, or maximum a posteriori with intervals.
 
 All participants and all restarts are one batch of Newton's method, with exact derivatives of the
-likelihood. The prior is normal on the real scale of each parameter (see `Parameter`), and so is the
-posterior near its mode (Laplace): its curvature gives intervals and the evidence of the model.
+likelihood. The prior is normal on the real scale of each parameter (see `Parameter`). Intervals and
+the evidence of a model come from draws from the posterior (see `posterior`); without a prior,
+intervals come from the curvature at the maximum, and there is no evidence.
 """
 
 from __future__ import annotations
 
 import functools
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -17,6 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from scilab_rl.analysis.fitting import posterior
 from scilab_rl.analysis.fitting.panel import Panel
 from scilab_rl.config.classes import find_target
 from scilab_rl.config.workspace import config_files
@@ -26,7 +27,7 @@ from scilab_rl.learning.cognitive import CognitiveModel, Seen, log_likelihoods
 MAP, MLE = "map", "mle"
 _FARTHEST = 12.0  # on the real scale, where a probability is 0 or 1 to five digits
 _N_ITERATIONS = 60
-_N_TRIED = 20  # random places, of which the best are starts
+_N_TRIED = posterior.N_DRAWS  # random places, of which the best are starts: the same shape
 N_BATCHES = 5  # restarts, and folds: one shape, compiled once
 Z_95 = 1.959964
 
@@ -40,10 +41,11 @@ class Fit:
         model: The model.
         panel: The choices.
         real: Estimates on the real scale. Shapes: ``(n_participants, n_parameters)``.
-        covariance: Of the posterior there. Shapes: ``(n_participants, n_parameters,
-            n_parameters)``.
+        low, high: Ends of their 95 % intervals, as above.
         log_likelihood: At the estimates. Shapes: ``(n_participants,)``.
-        log_evidence: Laplace's approximation; NaN for maximum likelihood. Shapes as above.
+        log_evidence: NaN for maximum likelihood. Shapes as above.
+        n_effective: Effective draws from the posterior; NaN for maximum likelihood. Shapes as
+            above.
         converged: Whether the gradient is zero there. Shapes as above.
         n_agreeing: Restarts that ended in the same place. Shapes as above.
     """
@@ -52,9 +54,11 @@ class Fit:
     model: type[CognitiveModel]
     panel: Panel
     real: np.ndarray
-    covariance: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
     log_likelihood: np.ndarray
     log_evidence: np.ndarray
+    n_effective: np.ndarray
     converged: np.ndarray
     n_agreeing: np.ndarray
 
@@ -71,8 +75,7 @@ class Fit:
     @property
     def intervals(self) -> dict[str, tuple[np.ndarray, np.ndarray]]:
         """The ends of the 95 % intervals, by parameter."""
-        sd = np.sqrt(np.maximum(np.diagonal(self.covariance, axis1=1, axis2=2), 0.0))
-        low, high = (natural(self.model, self.real + sign * Z_95 * sd) for sign in (-1, 1))
+        low, high = natural(self.model, self.low), natural(self.model, self.high)
         return {name: (low[name], high[name]) for name in low}
 
     @property
@@ -166,24 +169,49 @@ def fit(
     x, loss, gradient, hessian = minimize(model, panel, method, starts)
     people, best = np.arange(len(x)), loss.argmin(axis=1)
     real, minimum, curved = x[people, best], loss[people, best], hessian[people, best]
-    d = real.shape[1]
-    prior_part = -minimum if method == MAP else np.full(len(x), np.nan)
-    log_likelihood = -minimum - (_log_prior(model, real) if method == MAP else 0.0)
-    sign, logdet = np.linalg.slogdet(curved)
-    evidence = prior_part + 0.5 * d * math.log(2 * math.pi) - 0.5 * logdet
     at_edge = np.abs(real).max(axis=1, initial=0.0) >= _FARTHEST
     flat = np.abs(gradient[people, best]).max(axis=1, initial=0.0) < 1e-3
+    around = _posterior if method == MAP else _curvature_only
     return Fit(
         name=name,
         model=model,
         panel=panel,
         real=real,
-        covariance=np.linalg.pinv(curved, hermitian=True),
-        log_likelihood=log_likelihood,
-        log_evidence=np.where(sign > 0, evidence, np.nan),
+        log_likelihood=-minimum - (_log_prior(model, real) if method == MAP else 0.0),
         converged=flat & ~at_edge,
         n_agreeing=(loss < minimum[:, None] + 1e-3).sum(axis=1),
+        **around(model, panel, real, curved, seed),
     )
+
+
+def _posterior(
+    model: type[CognitiveModel], panel: Panel, real: np.ndarray, hessian: np.ndarray, seed: int
+) -> dict[str, np.ndarray]:
+    """Return what draws from the posterior say: intervals, evidence and their number."""
+    mean, sd = _prior(model)
+    volume = np.log(sd).sum()
+
+    def log_joint(z: np.ndarray) -> np.ndarray:
+        return volume - _losses(model, panel, MAP, mean + sd * z)
+
+    rng = np.random.default_rng(seed)
+    draws = posterior.sample(log_joint, (real - mean) / sd, hessian * np.outer(sd, sd), rng)
+    return {
+        "low": mean + sd * draws.quantile(0.025),
+        "high": mean + sd * draws.quantile(0.975),
+        "log_evidence": draws.log_evidence,
+        "n_effective": draws.n_effective,
+    }
+
+
+def _curvature_only(
+    model: type[CognitiveModel], panel: Panel, real: np.ndarray, hessian: np.ndarray, seed: int
+) -> dict[str, np.ndarray]:
+    """Return intervals of a normal likelihood (Wald), and that there is no posterior."""
+    covariance = np.linalg.pinv(hessian, hermitian=True)
+    error = Z_95 * np.sqrt(np.maximum(np.diagonal(covariance, axis1=1, axis2=2), 0.0))
+    none = np.full(len(real), np.nan)
+    return {"low": real - error, "high": real + error, "log_evidence": none, "n_effective": none}
 
 
 def minimize(
@@ -225,7 +253,7 @@ def _log_prior(model: type[CognitiveModel], real: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _Objective:
-    """What is minimized, for a batch of participants, compiled."""
+    """What is minimized, compiled: for several points per participant, and for one each."""
 
     loss: Callable[..., Any]
     curvature: Callable[..., Any]
@@ -254,7 +282,8 @@ def _objective(
         hessian, (value, slope) = jax.jacfwd(with_value, has_aux=True)(x)
         return value, slope, hessian
 
-    return _Objective(*(jax.jit(jax.vmap(function)) for function in (loss, curvature)))
+    losses = jax.vmap(loss, (0, None, None, None))
+    return _Objective(*(jax.jit(jax.vmap(function)) for function in (losses, curvature)))
 
 
 def _prior(model: type[CognitiveModel]) -> tuple[np.ndarray, np.ndarray]:
@@ -266,13 +295,20 @@ def _good_starts(
     model: type[CognitiveModel], panel: Panel, method: str, k: int, seed: int
 ) -> np.ndarray:
     """Return the best draws from the prior. Shapes: ``(n_participants, k, n_parameters)``."""
-    objective = _objective(model, panel.n_states, panel.n_actions, method == MAP)
     tried = prior_draws(model, max(_N_TRIED, k), np.random.default_rng(seed))
-    data = (panel.seen, panel.responses, panel.counts)
-    n = len(panel.participants)
+    losses = _losses(model, panel, method, np.tile(tried, (len(panel.participants), 1, 1)))
+    return tried[np.argsort(losses, axis=1)[:, :k]]
+
+
+def _losses(model: type[CognitiveModel], panel: Panel, method: str, x: np.ndarray) -> np.ndarray:
+    """Return what is minimized.
+
+    Shapes:
+        x: ``(n_participants, k, n_parameters)``; result: ``(n_participants, k)``.
+    """
+    objective = _objective(model, panel.n_states, panel.n_actions, method == MAP)
     with jax.enable_x64(True):
-        losses = [np.asarray(objective.loss(np.tile(x, (n, 1)), *data)) for x in tried]
-    return tried[np.argsort(np.stack(losses, axis=1), axis=1)[:, :k]]
+        return np.asarray(objective.loss(x, panel.seen, panel.responses, panel.counts))
 
 
 def _newton(

@@ -102,7 +102,8 @@ def test_a_bias_is_estimated_as_the_log_odds():
     found = fit("randomchoice", panel, method="mle")
     assert np.isclose(found.values["bias"][0], np.log(3.0), atol=1e-6)
     assert np.isclose(found.log_likelihood[0], 30 * np.log(0.75) + 10 * np.log(0.25))
-    assert np.isclose(found.covariance[0, 0, 0], 1 / (40 * 0.75 * 0.25), rtol=1e-4)
+    half = 1.959964 / np.sqrt(40 * 0.75 * 0.25)
+    assert np.allclose(found.intervals["bias"], [[np.log(3.0) - half], [np.log(3.0) + half]])
     assert np.isclose(found.bic[0], -2 * found.log_likelihood[0] + np.log(40))
     assert found.converged.all()
 
@@ -114,6 +115,7 @@ def test_the_prior_draws_estimates_towards_its_mean():
     b = found.values["bias"][0]
     assert np.isclose(30 - 40 / (1 + np.exp(-b)), b, atol=1e-6)
     assert np.isfinite(found.log_evidence[0]) and found.log_evidence[0] < found.log_likelihood[0]
+    assert found.n_effective[0] > 200
 
 
 def test_parameters_of_simulated_participants_are_found(fits, learners):
