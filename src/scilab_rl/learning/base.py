@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeAlias, TypeVar
 
 import numpy as np
 import torch
@@ -35,6 +35,7 @@ from scilab_rl.metrics.logger import MetricLogger
 # Hyperparameters named in the message when a number is no longer one.
 SHOWN_WITH_NAN = ("learning_rate", "gamma", "batch_size")
 Self = TypeVar("Self", bound="OneFileAlgorithm")
+Recalled: TypeAlias = tuple[np.ndarray, ...] | None  # what a policy with a memory knows
 
 
 class OneFileAlgorithm(ABC):
@@ -127,27 +128,34 @@ class OneFileAlgorithm(ABC):
     def predict(
         self,
         observation: Observation,
-        state: tuple[np.ndarray, ...] | None = None,
+        state: Recalled = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
+    ) -> tuple[np.ndarray, Recalled]:
         """Choose actions for observations as the environment gives them.
 
         Args:
             observation: One observation or a batch of them.
-            state: Returned unchanged; the policies here have no memory.
-            episode_start: Ignored, as above.
+            state: What the last call has returned.
+            episode_start: Ignored: an observation shows a memory when to begin anew.
             deterministic: Whether the most likely action is taken.
 
         Returns:
-            Actions in the environment's bounds, batched if the observations are, and ``state``.
+            Actions in the environment's bounds, batched if the observations are, and the state,
+            unchanged by policies without memory.
         """
         is_batch = is_vectorized_observation(observation, self.observation_space)  # type: ignore[arg-type]
-        if not is_batch:
-            observation = batch_of_one(observation)
-        with torch.no_grad():
-            actions = self.to_env_actions(self.act(self.to_vector(observation), deterministic))
+        batch = observation if is_batch else batch_of_one(observation)
+        actions, state = self.choose_actions(batch, state, deterministic)
         return (actions if is_batch else actions[0]), state
+
+    def choose_actions(
+        self, observations: Observation, state: Recalled, deterministic: bool
+    ) -> tuple[np.ndarray, Recalled]:
+        """Choose actions in the environment's bounds for a batch; see `predict`."""
+        with torch.no_grad():
+            actions = self.act(self.to_vector(observations), deterministic)
+            return self.to_env_actions(actions), state
 
     def set_logger(self, logger: MetricLogger) -> None:
         """Let metrics be recorded by this logger."""

@@ -22,12 +22,12 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.utils import is_vectorized_observation
+from stable_baselines3.common.vec_env import VecEnv
 
 from scilab_rl.envs.choices.trial_space import TrialSpace
 from scilab_rl.envs.types import Observation
 from scilab_rl.errors import ConfigError
-from scilab_rl.learning.base import OneFileAlgorithm
+from scilab_rl.learning.base import OneFileAlgorithm, Recalled
 
 Array = jax.Array | np.ndarray
 Values = Mapping[str, Any]  # of parameters, by name
@@ -112,7 +112,10 @@ class CognitiveModel(OneFileAlgorithm):
     its parameters are those of the configuration.
 
     Args:
-        **common: Environments, seed and device, see `OneFileAlgorithm`.
+        env: Vector environment to act in.
+        seed: Of the choices and the environments; None: do not seed.
+        device: Accepted for all algorithms; models compute on the CPU.
+        **values: The parameters with which the model acts.
 
     Attributes:
         parameters: The free parameters, by name.
@@ -127,12 +130,15 @@ class CognitiveModel(OneFileAlgorithm):
     n_stages: ClassVar[int] = 1
     chooses_by_chance: ClassVar[bool] = True
 
-    def __init__(self, **common: Any) -> None:
-        super().__init__(**common)
+    def __init__(
+        self, *, env: VecEnv, seed: int | None = None, device: str = "auto", **values: float
+    ) -> None:
+        super().__init__(env=env, seed=seed, device=device)
         space: Any = self.observation_space
         if problem := self.observation_problem(space):
             raise ConfigError(f"{type(self).__name__} cannot act here: {problem}")
-        self.values: dict[str, np.float32] = {}
+        self._check_bounds(values)
+        self.values = {name: np.float32(value) for name, value in values.items()}
         self.n_states: int = space.n_states
         self.memory = self.new_memory(self.n_envs)
 
@@ -164,18 +170,12 @@ class CognitiveModel(OneFileAlgorithm):
         needed = "hybrid is a model of two" if space.n_stages == 2 else "use env=TwoStep"
         return f"it models {cls.n_stages} choice(s) per trial, not {space.n_stages}; {needed}."
 
-    def set_parameters(self, **values: float) -> None:
-        """Set the parameters with which the model acts.
-
-        Raises:
-            ConfigError: If one is outside of its bounds.
-        """
+    def _check_bounds(self, values: Values) -> None:
         for name, value in values.items():
             low, high = self.parameters[name].low, self.parameters[name].high
             if not low <= value <= high:
                 limits = f"at least {low:g}" if math.isinf(high) else f"from {low:g} to {high:g}"
                 raise ConfigError(f"algorithm.{name} must be {limits}, but it is {value}.")
-        self.values = {name: np.float32(value) for name, value in values.items()}
 
     def iterate(self, callback: BaseCallback) -> bool:
         """Make one choice in each environment."""
@@ -187,29 +187,16 @@ class CognitiveModel(OneFileAlgorithm):
         callback.on_rollout_end()
         return True
 
-    def predict(
-        self,
-        observation: Observation,
-        state: tuple[np.ndarray, ...] | None = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = False,
-    ) -> tuple[np.ndarray, tuple[np.ndarray, ...] | None]:
-        """Choose, and return what is known now.
-
-        Args:
-            observation: One observation or a batch of them.
-            state: What the last call has returned; None: nothing but the last trial is known.
-            episode_start: Ignored: an observation shows whether a block begins.
-            deterministic: Whether the most probable response is taken.
-        """
-        is_batch = is_vectorized_observation(observation, self.observation_space)  # type: ignore[arg-type]
-        batch = np.asarray(observation if is_batch else np.asarray(observation)[None])
-        memory = self.new_memory(len(batch))
+    def choose_actions(
+        self, observations: Observation, state: Recalled, deterministic: bool
+    ) -> tuple[np.ndarray, Recalled]:
+        """Choose, and return what is known now; without a state, only the last trial is known."""
+        memory = self.new_memory(len(observations))
         if state is not None:
             memory = jax.tree.unflatten(jax.tree.structure(memory), state)
-        probabilities, memory = self._advance(batch, memory)
+        probabilities, memory = self._advance(observations, memory)
         actions = probabilities.argmax(axis=1) if deterministic else sample(probabilities)
-        return (actions if is_batch else actions[0]), tuple(jax.tree.leaves(memory))
+        return actions, tuple(jax.tree.leaves(memory))
 
     def act(self, observations: torch.Tensor, deterministic: bool) -> torch.Tensor:
         """Choose from the last trial alone."""

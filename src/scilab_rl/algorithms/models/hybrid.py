@@ -72,8 +72,7 @@ class HYBRID(CognitiveModel):
         stickiness: float = 0.1,
         **common: Any,
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(
+        super().__init__(
             learning_rate_1=learning_rate_1,
             learning_rate_2=learning_rate_2,
             inverse_temperature_1=inverse_temperature_1,
@@ -81,6 +80,7 @@ class HYBRID(CognitiveModel):
             eligibility=eligibility,
             model_based_weight=model_based_weight,
             stickiness=stickiness,
+            **common,
         )
 
     @staticmethod

@@ -52,8 +52,7 @@ class KALMANTHOMPSON(CognitiveModel):
     def __init__(
         self, *, observation_sd: float = 0.4, drift_sd: float = 0.1, **common: Any
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(observation_sd=observation_sd, drift_sd=drift_sd)
+        super().__init__(observation_sd=observation_sd, drift_sd=drift_sd, **common)
 
     @staticmethod
     def initial(parameters: Values, n_states: int, n_actions: int) -> Memory:

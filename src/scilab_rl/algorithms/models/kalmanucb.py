@@ -58,12 +58,12 @@ class KALMANUCB(CognitiveModel):
         uncertainty_bonus: float = 0.5,
         **common: Any,
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(
+        super().__init__(
             observation_sd=observation_sd,
             drift_sd=drift_sd,
             inverse_temperature=inverse_temperature,
             uncertainty_bonus=uncertainty_bonus,
+            **common,
         )
 
     @staticmethod

@@ -27,8 +27,7 @@ class RANDOMCHOICE(CognitiveModel):
     parameters: ClassVar = {"bias": Parameter(mean=0.0, sd=1.0)}
 
     def __init__(self, *, bias: float = 0.0, **common: Any) -> None:
-        super().__init__(**common)
-        self.set_parameters(bias=bias)
+        super().__init__(bias=bias, **common)
 
     @staticmethod
     def initial(parameters: Values, n_states: int, n_actions: int) -> Memory:

@@ -43,8 +43,9 @@ class RESCORLAWAGNER(CognitiveModel):
     def __init__(
         self, *, learning_rate: float = 0.3, inverse_temperature: float = 5.0, **common: Any
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(learning_rate=learning_rate, inverse_temperature=inverse_temperature)
+        super().__init__(
+            learning_rate=learning_rate, inverse_temperature=inverse_temperature, **common
+        )
 
     @staticmethod
     def initial(parameters: Values, n_states: int, n_actions: int) -> Memory:

@@ -51,11 +51,11 @@ class RESCORLAWAGNER2(CognitiveModel):
         inverse_temperature: float = 5.0,
         **common: Any,
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(
+        super().__init__(
             learning_rate_gain=learning_rate_gain,
             learning_rate_loss=learning_rate_loss,
             inverse_temperature=inverse_temperature,
+            **common,
         )
 
     @staticmethod

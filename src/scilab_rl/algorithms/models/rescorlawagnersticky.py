@@ -54,11 +54,11 @@ class RESCORLAWAGNERSTICKY(CognitiveModel):
         stickiness: float = 0.5,
         **common: Any,
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(
+        super().__init__(
             learning_rate=learning_rate,
             inverse_temperature=inverse_temperature,
             stickiness=stickiness,
+            **common,
         )
 
     @staticmethod

@@ -46,8 +46,7 @@ class WINSTAYLOSESHIFT(CognitiveModel):
     def __init__(
         self, *, p_stay_win: float = 0.9, p_shift_loss: float = 0.6, **common: Any
     ) -> None:
-        super().__init__(**common)
-        self.set_parameters(p_stay_win=p_stay_win, p_shift_loss=p_shift_loss)
+        super().__init__(p_stay_win=p_stay_win, p_shift_loss=p_shift_loss, **common)
 
     @staticmethod
     def initial(parameters: Values, n_states: int, n_actions: int) -> Memory:
