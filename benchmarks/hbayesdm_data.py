@@ -274,7 +274,7 @@ def sample_ours(task: Task, panel: Panel, sizes: tuple[int, int]) -> Sampled:
     group, order = natural(task.model, posterior.group), [*task.model.parameters]
     draws = {name: group[ours] / divisor for name, (ours, divisor) in task.names.items()}
     draws |= {
-        f"sd of {name}": posterior.spread[:, order.index(ours)]
+        f"sd of {name}": posterior.spread[..., order.index(ours)]
         for name, (ours, _) in task.names.items()
     }
     chained = {name: values.reshape(N_CHAINS, -1) for name, values in draws.items()}

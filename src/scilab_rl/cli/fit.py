@@ -28,6 +28,9 @@ def main(arguments: list[str]) -> int:
     method = str(settings.get("method", "map"))
     if method not in METHODS:
         raise ConfigError(f"method must be map or mle, but it is '{method}'.")
+    hierarchical = _is_true("hierarchical", settings.get("hierarchical", "false"))
+    if options.arviz and not hierarchical:
+        raise ConfigError("--arviz writes hierarchical samples; add hierarchical=true.")
     if not tables:
         raise ConfigError("fit requires a table of choices: fit choices.csv model=rescorlawagner.")
     open_project()
@@ -50,7 +53,7 @@ def main(arguments: list[str]) -> int:
         panel,
         models,
         method=method,
-        hierarchical=_is_true("hierarchical", settings.get("hierarchical", "false")),
+        hierarchical=hierarchical,
         env=str(settings.get("env", "")),
         env_kwargs=env_kwargs_of(words),
         seed=whole("seed", settings.get("seed", "0"), 0),
@@ -59,14 +62,14 @@ def main(arguments: list[str]) -> int:
     )
     name = slug(f"{Path(tables[0]).stem}-{'-'.join(models)}")
     folder = options.output or options.base_logdir / FOLDER / name
-    page = write_fit(results, folder, f"{Path(tables[0]).stem}", parquet=options.parquet)
+    title = Path(tables[0]).stem
+    page = write_fit(results, folder, title, parquet=options.parquet, arviz=options.arviz)
     if options.json:
         print_json({"models": model_rows(results), "groups": group_rows(results)})
     else:
         optional = ("parameters", "AIC", "converged")
-        print_rows(
-            MODEL_COLUMNS, model_rows(results), optional=optional, if_any=("frequency", "PXP")
-        )
+        if_any = ("LOO P", "bad k", "frequency", "PXP")
+        print_rows(MODEL_COLUMNS, model_rows(results), optional=optional, if_any=if_any)
         print_rows(("model", "parameter", "group mean", "low", "high"), group_rows(results))
         for line in (*conclusions(results), *results.recovery):
             write(line)
@@ -171,5 +174,10 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     add("--warmup", type=positive, default=500, help="steps of each chain before sampling")
     add("--samples", type=positive, default=1000, help="samples of each of the four chains")
     add("--parquet", action="store_true", help="write the tables as Parquet too")
+    add(
+        "--arviz",
+        action="store_true",
+        help="write the samples of each model as MODEL.nc too (hierarchical=true)",
+    )
     add("--output", type=Path, metavar="DIR", help="default: data/fits/NAME")
     return parser.parse_args(arguments)

@@ -17,10 +17,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from scilab_rl.analysis.fitting.estimation import Fit, natural
+from scilab_rl.analysis.fitting.panel import Panel
 from scilab_rl.errors import MissingDependencyError
 from scilab_rl.learning.cognitive import CognitiveModel, Seen, log_likelihoods
 
 MOST_R_HAT, LEAST_EFFECTIVE = 1.01, 400.0
+# What NumPyro says of each draw, and how ArviZ calls it.
+_STATISTICS = {
+    "diverging": "diverging",
+    "num_steps": "n_steps",
+    "accept_prob": "acceptance_rate",
+    "energy": "energy",
+}
 
 
 @dataclass(frozen=True)
@@ -30,22 +38,33 @@ class Posterior:
     Attributes:
         name: The model's name.
         model: The model.
-        group: Group means. Shapes: ``(n_samples, n_parameters)``, on the real scale.
-        spread: Standard deviations between participants. Shapes: as ``group``.
-        participants: Shapes: ``(n_samples, n_participants, n_parameters)``, on the real scale.
+        panel: The choices.
+        group: Group means, on the real scale.
+        spread: Standard deviations between participants, on the real scale.
+        participants: Parameters of each, on the real scale.
+        statistics: Of the sampler, by ArviZ's names.
         r_hat: The largest of each kind of quantity.
         effective: The smallest effective sample size of each kind.
-        n_divergent: Divergent transitions after the warm-up.
+
+    Shapes:
+        group, spread: ``(n_chains, n_draws, n_parameters)``; participants: ``(n_chains, n_draws,
+        n_participants, n_parameters)``; statistics: ``(n_chains, n_draws)``.
     """
 
     name: str
     model: type[CognitiveModel]
+    panel: Panel
     group: np.ndarray
     spread: np.ndarray
     participants: np.ndarray
+    statistics: Mapping[str, np.ndarray]
     r_hat: Mapping[str, float]
     effective: Mapping[str, float]
-    n_divergent: int
+
+    @property
+    def n_divergent(self) -> int:
+        """Divergent transitions after the warm-up."""
+        return int(self.statistics["diverging"].sum())
 
     @property
     def problem(self) -> str:
@@ -128,18 +147,19 @@ def sample_posterior(
         chain_method="vectorized",
         progress_bar=False,
     )
-    sampler.run(jax.random.key(seed), extra_fields=("diverging",))
+    sampler.run(jax.random.key(seed), extra_fields=tuple(_STATISTICS))
     chains = sampler.get_samples(group_by_chain=True)
     chains = {name: np.asarray(chains[name]) for name in ("group", "spread", "participants")}
     quality = summary(chains)
-    flat = {name: draws.reshape(-1, *draws.shape[2:]) for name, draws in chains.items()}
+    said = sampler.get_extra_fields(group_by_chain=True)
     return Posterior(
         name=fitted.name,
         model=fitted.model,
-        **flat,
+        panel=fitted.panel,
+        **chains,
+        statistics={new: np.asarray(said[old]) for old, new in _STATISTICS.items()},
         r_hat={name: float(np.max(quality[name]["r_hat"])) for name in chains},
         effective={name: float(np.min(quality[name]["n_eff"])) for name in chains},
-        n_divergent=int(sampler.get_extra_fields()["diverging"].sum()),
     )
 
 

@@ -13,7 +13,16 @@ import numpy as np
 from scilab_rl.analysis.fitting import recovery as recoveries
 from scilab_rl.analysis.fitting.behavior import condition_rows, curve_charts
 from scilab_rl.analysis.fitting.estimation import MAP, Fit, fit
+from scilab_rl.analysis.fitting.hierarchical import Posterior, sample_posterior
+from scilab_rl.analysis.fitting.inference_data import (
+    LeaveOneOut,
+    import_arviz,
+    leave_one_out,
+    make_inference_data,
+    write_inference_data,
+)
 from scilab_rl.analysis.fitting.panel import Panel
+from scilab_rl.analysis.fitting.posterior import ENOUGH
 from scilab_rl.analysis.fitting.predictive import (
     Behavior,
     Curve,
@@ -39,7 +48,8 @@ from scilab_rl.pages import render
 _log = logging.getLogger(__name__)
 Row = Mapping[str, object]
 MODEL_COLUMNS = (
-    "model", "parameters", "AIC", "BIC", "held-out P", "accuracy", "frequency", "PXP", "converged",
+    "model", "parameters", "AIC", "BIC", "held-out P", "accuracy", "LOO P", "bad k", "frequency",
+    "PXP", "converged",
 )  # fmt: skip
 GROUP_COLUMNS = ("model", "parameter", "group mean", "low", "high")
 RECOVERY_COLUMNS = (
@@ -62,6 +72,8 @@ class FitResults:
         curves: How that changes, in the same order; only of the data without a known task.
         simulated: Whether the models' behavior is simulated, or expected given the actual trials.
         posteriors: Hierarchical samples, one per model, if requested.
+        inference_data: The same for ArviZ.
+        left_out: What PSIS-LOO says of them.
         recovery: Sentences about the recovery of the models.
     """
 
@@ -72,7 +84,9 @@ class FitResults:
     behavior: dict[str, Behavior]
     curves: dict[str, list[Curve]]
     simulated: bool
-    posteriors: list[Any] = field(default_factory=list)
+    posteriors: list[Posterior] = field(default_factory=list)
+    inference_data: list[Any] = field(default_factory=list)
+    left_out: list[LeaveOneOut] = field(default_factory=list)
     recovery: list[str] = field(default_factory=list)
 
     @property
@@ -109,11 +123,11 @@ def fit_all(
     fits = [fit(name, panel, method=method, seed=seed) for name in models]
     posteriors = []
     if hierarchical:
-        from scilab_rl.analysis.fitting.hierarchical import sample_posterior
-
+        import_arviz()  # before minutes of sampling
         for fitted in fits:
             _log.info("%s: sampling the population.", fitted.name)
             posteriors.append(sample_posterior(fitted, seed=seed, **(sampling or {})))
+    samples = [make_inference_data(p) for p in posteriors]
     behavior, curves, simulated = _behavior(panel, fits, env or panel.env, env_kwargs or {}, seed)
     evidence = np.stack([_score(fitted) for fitted in fits], axis=1)
     n_trials = float(np.mean(panel.n_choices)) / panel.n_stages
@@ -126,6 +140,8 @@ def fit_all(
         curves=curves,
         simulated=simulated,
         posteriors=posteriors,
+        inference_data=samples,
+        left_out=list(map(leave_one_out, posteriors, samples)),
         recovery=[recoveries.sentence(name, n_trials, base) for name in models],
     )
 
@@ -172,6 +188,14 @@ def model_rows(results: FitResults) -> list[dict[str, object]]:
                 "converged": f"{int(fitted.converged.sum())}/{len(fitted.converged)}",
             }
         )
+        if results.left_out:
+            left_out = results.left_out[index]
+            rows[-1] |= {
+                "elpd LOO": f"{left_out.elpd:.1f}",
+                "SE": f"{left_out.error:.1f}",
+                "LOO P": round(float(np.exp(left_out.elpd / left_out.n_choices)), 3),
+                "bad k": f"{left_out.n_bad}/{left_out.n_choices}",
+            }
         if results.selection is not None:
             rows[-1] |= {
                 "frequency": round(float(results.selection.frequencies[index]), 3),
@@ -270,8 +294,10 @@ def fit_page(results: FitResults, title: str) -> str:
         f"{panel.n_actions} responses.",
         models=_table(MODEL_COLUMNS, model_rows(results)),
         models_caption="Smaller AIC and BIC, and larger probabilities of held-out choices, are "
-        "better. Frequency: estimated share of participants with the model. PXP: protected "
-        "exceedance probability, that it is the most frequent one (Rigoux et al., 2014).",
+        "better. LOO P: probability of a choice given all others, from the hierarchical samples; "
+        "it is unreliable for choices with a bad Pareto k. Frequency: estimated share of "
+        "participants with the model. PXP: protected exceedance probability, that it is the most "
+        "frequent one (Rigoux et al., 2014).",
         choices=condition_rows(results.behavior),
         choices_caption=f"Means over participants with 95 % intervals; {kind}.",
         curves=curve_charts(results.curves),
@@ -288,11 +314,24 @@ def _quality(results: FitResults) -> str:
         f"{min(p.effective.values()):.0f}, {p.n_divergent} divergent transitions."
         for p in results.posteriors
     ]
+    for fitted in results.fits:
+        if n_few := int((fitted.n_effective < ENOUGH).sum()):
+            lines.append(
+                f"{fitted.name}: the intervals of {n_few} participants are rough, from fewer than "
+                f"{ENOUGH:.0f} effective draws."
+            )
     return " ".join(lines)
 
 
-def write_fit(results: FitResults, folder: Path, title: str, *, parquet: bool = False) -> Path:
-    """Write the page and the tables into a folder; return the page."""
+def write_fit(
+    results: FitResults,
+    folder: Path,
+    title: str,
+    *,
+    parquet: bool = False,
+    arviz: bool = False,
+) -> Path:
+    """Write the page, the tables and perhaps the samples into a folder; return the page."""
     folder.mkdir(parents=True, exist_ok=True)
     write_text(folder / "fit.html", fit_page(results, title))
     suffixes = (".csv", ".parquet") if parquet else (".csv",)
@@ -300,6 +339,9 @@ def write_fit(results: FitResults, folder: Path, title: str, *, parquet: bool = 
         write_table(model_rows(results), folder / f"models{suffix}")
         write_table(group_rows(results), folder / f"groups{suffix}")
         write_table(participant_rows(results), folder / f"participants{suffix}")
+    if arviz:
+        for posterior, samples in zip(results.posteriors, results.inference_data, strict=True):
+            write_inference_data(samples, folder / f"{posterior.name}.nc")
     return folder / "fit.html"
 
 

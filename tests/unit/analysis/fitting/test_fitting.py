@@ -239,6 +239,7 @@ def test_the_command_fits_a_table(tmp_path, monkeypatch, capsys, learners):
         (["nothing.csv", "model=hybrid"], "There is no table"),
         (["choices.csv", "modle=hybrid"], "Did you mean 'model'"),
         (["choices.csv", "model=hybrid", "method=ml"], "map or mle"),
+        (["choices.csv", "model=hybrid", "--arviz"], "add hierarchical=true"),
     ):
         with pytest.raises(ConfigError, match=message):
             command.main(words)
