@@ -87,6 +87,8 @@ def compose(*overrides: str) -> Any:
             # Stable-Baselines3's off-policy n_steps is the length of returns, not of rollouts.
             and not (key == "n_steps" and algorithm[key] < limit)
         ]
+        if "data" in algorithm:  # of an offline algorithm
+            small.append("++algorithm.data=random:3")
         # Few steps reach the first update only where few environments share them.
         return composition.compose([*overrides, *small, f"n_envs={min(2, cfg.n_envs)}"])
 

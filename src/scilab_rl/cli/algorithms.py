@@ -41,7 +41,7 @@ def describe_all() -> list[dict[str, object]]:
 
 
 def _describe(name: str, path: Path) -> dict[str, object]:
-    from scilab_rl.learning.compatibility import reads_dictionaries, supported_action_spaces
+    from scilab_rl.learning.compatibility import supported_action_spaces
     from scilab_rl.run.checks import algorithm_class
 
     row: dict[str, object] = {
@@ -58,15 +58,19 @@ def _describe(name: str, path: Path) -> dict[str, object]:
         row["class"] = cfg.algorithm.target
         cls = algorithm_class(cfg)
         row["actions"] = [space.__name__ for space in supported_action_spaces(cls) or ()]
-        row["hindsight"] = _hindsight(cfg.algorithm) if reads_dictionaries(cls) else "no"
+        row["hindsight"] = _hindsight(cls, cfg.algorithm)
     except Exception as error:  # noqa: BLE001 - a file of the project may raise anything
         row["problem"] = f"{type(error).__name__}: {error}"
     return row
 
 
-def _hindsight(algorithm: AlgorithmConfig) -> str:
+def _hindsight(cls: type, algorithm: AlgorithmConfig) -> str:
     """Return whether an algorithm relabels: yes, off (it could), or no (no replay buffer)."""
-    if "replay_buffer_class" not in algorithm.arguments:
+    from scilab_rl.learning.compatibility import reads_dictionaries
+
+    if getattr(cls, "learns_offline", False):
+        return "yes"
+    if not reads_dictionaries(cls) or "replay_buffer_class" not in algorithm.arguments:
         return "no"
     return "off" if algorithm.arguments["replay_buffer_class"] is None else "yes"
 

@@ -40,6 +40,7 @@ def trained(request, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "conf").mkdir()  # Hydra warns where a project folder has none
     sizes = {name: ["algorithm.n_steps=20"] for name in ("cleanppo", "recurrentppo")}
+    sizes["jaxgciql"] = ["algorithm.batch_size=8", "algorithm.data=random:3"]
     small = ["algorithm.batch_size=8", "algorithm.learning_starts=20"]
     sizes_of_nets = "++algorithm.policy_kwargs.net_arch=[8]"
     if request.param.startswith(("clean", "jax")):
