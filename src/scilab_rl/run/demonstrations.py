@@ -31,8 +31,10 @@ if TYPE_CHECKING:  # heavy
     from scilab_rl.learning.algorithm import Algorithm
     from scilab_rl.learning.replay import HindsightReplayBuffer
 
+HUMAN = "human"
 _EXAMPLES = {
     SCRIPTED: "scripted:100", RANDOM: "random:100", "run": "run:RUN:100", "minari": "minari:ID",
+    HUMAN: "human:FILE",
 }  # fmt: skip
 _DATA_KINDS = tuple(_EXAMPLES)
 _DEMO_KINDS = tuple(kind for kind in _EXAMPLES if kind != RANDOM)
@@ -47,9 +49,9 @@ class DemoSettings:
     """The key ``algorithm.demos``, or ``algorithm.data`` of an offline algorithm.
 
     Attributes:
-        kind: ``scripted``, ``run``, ``minari`` or, as data, ``random``.
-        name: Of the run or the data set.
-        n_episodes: How many; 0: all of a data set of Minari.
+        kind: ``scripted``, ``run``, ``minari``, ``human`` or, as data, ``random``.
+        name: Of the run, the data set or the file.
+        n_episodes: How many; 0: all of a data set of Minari, or of a file.
         share: Of each batch. Data are all of it, and their failures count too.
     """
 
@@ -114,7 +116,7 @@ def _parse_source(key: str, given: object, kinds: Sequence[str], share: float) -
     has_name = kind not in (SCRIPTED, RANDOM)
     if has_name and not (name and number.isdigit()):
         name, number = rest, str(_N_EPISODES if kind == "run" else 0)
-    is_whole = number.isdigit() and (kind == "minari" or int(number) > 0)
+    is_whole = number.isdigit() and (kind in ("minari", HUMAN) or int(number) > 0)
     if kind not in kinds or not rest or not is_whole or (name and not has_name):
         examples = [_EXAMPLES[kind] for kind in kinds]
         raise ConfigError(
@@ -159,7 +161,7 @@ def prepare_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
             "++algorithm.replay_buffer_class=auto, or algorithm.demos=null."
         )
     seed = derive_seed(cfg.seed, "demos")
-    buffer.use_demos(_n_rows(settings, algorithm), settings.share, seed)
+    buffer.use_demos(_n_rows(settings, cfg, algorithm), settings.share, seed)
 
 
 def collect_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
@@ -178,6 +180,8 @@ def collect_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
             _store(ring, algorithm, step)
         ring.truncate_last_trajectory()
         n_episodes, n_steps = n_episodes + 1, n_steps + len(episode)
+    if not n_episodes:
+        raise ConfigError(f"{settings.key}: '{settings.name}' has no episode that can be used.")
     normalizer = getattr(algorithm, "normalizer", None)
     if normalizer is not None:
         normalizer.update(ring.rows[: n_steps + n_episodes, 0])
@@ -186,13 +190,17 @@ def collect_demos(cfg: RunConfig, algorithm: Algorithm) -> None:
     )
 
 
-def _n_rows(settings: DemoSettings, algorithm: Algorithm) -> int:
+def _n_rows(settings: DemoSettings, cfg: RunConfig, algorithm: Algorithm) -> int:
     """Return how many rows the demonstrations take at most."""
     from scilab_rl.learning.compatibility import longest_episode
 
     if settings.kind == "minari":
         data = _data_set(settings.name)
         return int(data.total_steps + data.total_episodes)
+    if settings.kind == HUMAN:
+        from scilab_rl.run.played import read_played
+
+        return sum(len(episode.keys) + 1 for episode in read_played(settings.name, cfg))
     longest = longest_episode(algorithm.get_env())
     if longest is None:
         raise ConfigError(
@@ -221,6 +229,9 @@ def _store(ring: HindsightReplayBuffer, algorithm: Any, step: Step) -> None:
 def _episodes(settings: DemoSettings, cfg: RunConfig) -> Iterator[list[Step]]:
     if settings.kind == "minari":
         yield from _stored_episodes(settings)
+        return
+    if settings.kind == HUMAN:
+        yield from _played_episodes(settings, cfg)
         return
     seed = derive_seed(cfg.seed, "demos")
     name = settings.name or settings.kind
@@ -260,6 +271,16 @@ def _successes(
         f"algorithm.demos: only {n_found} of {n_tries} episodes were successful, and "
         f"{settings.n_episodes} demonstrations are wanted; take another source."
     )
+
+
+def _played_episodes(settings: DemoSettings, cfg: RunConfig) -> Iterator[list[Step]]:
+    from scilab_rl.run.played import play_again
+
+    for number, episode in enumerate(play_again(settings.name, cfg)):
+        if settings.n_episodes and number == settings.n_episodes:
+            return
+        if settings.is_data_set or success_of(episode[-1].info) is not False:
+            yield episode
 
 
 def _data_set(name: str) -> Any:

@@ -62,6 +62,11 @@ class Option:
     action: Any
 
 
+def episode_seed(run_seed: int, code: str, phase: str, episode: int) -> int:
+    """Return the seed of a participant's episode."""
+    return derive_seed(run_seed, "human", code, phase, episode)
+
+
 def options_of(env: RunEnv) -> tuple[Option, ...]:
     """Return what a person can do in each step, a key for each.
 
@@ -133,8 +138,10 @@ class Session:
 
     def _begin(self, episode: int) -> None:
         self.episode, self.step, self.total = episode, 0, 0.0
-        words = ("human", str(self.origin["participant_id"]), self.phase, episode)
-        seed = derive_seed(int(self.origin["run_seed"]), *words)
+        origin = self.origin
+        seed = episode_seed(
+            int(origin["run_seed"]), str(origin["participant_id"]), self.phase, episode
+        )
         self.observation = self.env.reset(seed=seed)[0]
 
     def choose(self, key: str, *, draws: bool) -> tuple[Row, bytes]:
