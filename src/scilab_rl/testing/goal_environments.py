@@ -41,16 +41,12 @@ class EnvironmentContract:
     accepted: tuple[str, ...] = ()
 
     def test_doctor_finds_no_fault(self) -> None:
-        """Shapes, rewards, success, endings, goals, seeds, pickling, stability, pictures."""
+        """Shapes, rewards, success, endings, goals, seeds, pickling, stability."""
         make = partial(make_single_env, RunConfig(self.env, self.env_kwargs))
-        known = fingerprint.known(self.env)
         faults = [
             f"{finding.check}: {finding.found} ({finding.fix})"
             for finding in check_environment(
-                make,
-                n_steps=self.n_steps,
-                known_fingerprints=known,
-                make_drawn=partial(make, "rgb_array"),
+                make, n_steps=self.n_steps, known_fingerprints=fingerprint.known(self.env)
             )
             if finding.result in (WARN, FAIL) and finding.check not in self.accepted
         ]
