@@ -29,8 +29,8 @@ BEHIND_AN_EXTRA = {
     "algorithms/jaxcrl.py", "algorithms/jaxgciql.py",
     "algorithms/jaxsac.py", "algorithms/jaxtd3.py", "learning/cognitive.py",
     *(f"algorithms/models/{name}.py" for name in MODELS),
-    *(f"analysis/fitting/{name}.py" for name in ("estimation", "hierarchical", "inference_data", "selection")),
-    "analysis/fitting/simulation.py",
+    *(f"analysis/fitting/{name}.py" for name in ("estimation", "hierarchical", "selection")),
+    "analysis/fitting/inference_data.py", "analysis/fitting/simulation.py",
     "envs/suites/highway_env.py", "envs/suites/metaworld.py", "envs/suites/panda_gym.py",
     "testing/algorithms.py", "testing/models.py",
 }  # fmt: skip
