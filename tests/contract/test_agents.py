@@ -67,8 +67,8 @@ def test_its_card_is_complete_and_holds_nothing_of_a_machine(agent) -> None:
     assert card["evaluation"]["episodes"] >= 1000 and len(card["evaluation"]["seeds"]) == 5
     assert card["training"]["curve"] and card["training"]["steps"] and card["training"]["minutes"]
     assert card["training"]["machine"]["processor"] and card["fingerprint"]
-    licence = f'license = "{card["licence"]}"'
-    assert licence in (ROOT / "pyproject.toml").read_text(encoding="utf-8"), licence
+    declared = f'license = "{card["license"]}"'
+    assert declared in (ROOT / "pyproject.toml").read_text(encoding="utf-8")
     manifest = checkpoint.verify(find_policy(agent, "finished"))
     assert manifest["step"] <= card["training"]["steps"]
     for path in agent.path.rglob("*"):

@@ -49,7 +49,7 @@ _log = logging.getLogger(__name__)
 
 
 def write_agent(
-    run: RunDirectory, policy: Path, name: str, folder: Path, *, n_episodes: int, licence: str
+    run: RunDirectory, policy: Path, name: str, folder: Path, *, n_episodes: int, license: str
 ) -> Path:
     """Make a trained agent from a run, and measure it in episodes that the run has never seen.
 
@@ -61,7 +61,7 @@ def write_agent(
         name: The agent's.
         folder: The folder of agents.
         n_episodes: How many episodes, a multiple of the five seeds.
-        licence: For example ``MIT``.
+        license: For example ``MIT``.
 
     Returns:
         The agent's folder.
@@ -88,7 +88,7 @@ def write_agent(
             about={"epoch": saved.get("epoch")},
         )  # fmt: skip
         _write_history(run, unfinished)
-        card = _card(run, unfinished, name, policy, saved["step"], n_episodes, licence)
+        card = _card(run, unfinished, name, policy, saved["step"], n_episodes, license)
         files.write_json(unfinished / CARD_FILE, card)
         files.write_text(unfinished / PAGE_FILE, "\n".join(card_page(card)) + "\n")
         if target.exists():
@@ -175,7 +175,7 @@ def _card(
     policy: Path,
     step: int,
     n_episodes: int,
-    licence: str,
+    license: str,
 ) -> dict[str, Any]:
     cfg = load_recorded(agent / CONFIG_FILE)
     measured = measure(RunDirectory(agent), SEEDS, n_episodes // len(SEEDS))
@@ -212,7 +212,7 @@ def _card(
             **{k: v for k, v in (source.get("versions") or {}).items() if k in PACKAGES},
         },
         "bytes": sum(path.stat().st_size for path in agent.rglob("*") if path.is_file()),
-        "licence": licence,
+        "license": license,
     }
 
 
@@ -244,7 +244,7 @@ def card_page(card: Mapping[str, Any]) -> Iterator[str]:
         ("versions", ", ".join(f"{k} {v}" for k, v in card["versions"].items())),
         ("commit", f"`{training['git_commit'] or 'unknown'}`"),
         ("date", card["date"]),
-        ("licence", card["licence"]),
+        ("license", card["license"]),
     ]
     if training["started_from_another_policy"]:
         rows.append(("note", "training started from another policy, whose steps are not counted"))

@@ -46,7 +46,7 @@ class DatasetSettings:
         n_episodes: How many episodes; failures are kept.
         random_share: Share of uniformly random actions of ``medium``.
         seed: Of the episodes.
-        licence: For example ``MIT``.
+        license: For example ``MIT``.
     """
 
     cfg: RunConfig
@@ -55,7 +55,7 @@ class DatasetSettings:
     n_episodes: int = 1000
     random_share: float = 0.5
     seed: int = 0
-    licence: str = "MIT"
+    license: str = "MIT"
 
     @property
     def policy(self) -> str:
@@ -101,8 +101,8 @@ def write_dataset(settings: DatasetSettings) -> tuple[Path, Estimate | None]:
     page = "\n".join(_page(dataset_id, settings, episodes, success, fingerprint)) + "\n"
     card = (
         f"{len(episodes)} episodes of {settings.cfg.env} by {settings.policy}; success {success}. "
-        f"Seed {settings.seed}. Fingerprint of the environment: {fingerprint}. Licence: "
-        f"{settings.licence}. Written by Scilab-RL."
+        f"Seed {settings.seed}. Fingerprint of the environment: {fingerprint}. License: "
+        f"{settings.license}. Written by Scilab-RL."
     )
     write_episodes(target, dataset_id, episodes, origin, card, page)
     return target, success
@@ -138,7 +138,7 @@ def _page(
         ("seed", str(settings.seed)),
         ("fingerprint", f"`{fingerprint}` of the environment"),
         ("versions", ", ".join(requirements())),
-        ("licence", settings.licence),
+        ("license", settings.license),
     ]
     yield f"# {dataset_id}\n"
     yield "Written by `scilab-rl dataset`, from the episodes themselves; do not edit.\n"

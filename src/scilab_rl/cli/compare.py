@@ -15,11 +15,14 @@ from scilab_rl.analysis.fitting.words import names_choices
 from scilab_rl.cli import compare_behavior
 from scilab_rl.cli.parser import CommandParser
 from scilab_rl.cli.tables import print_json, print_rows, write
+from scilab_rl.errors import ConfigError
 
 if TYPE_CHECKING:  # heavy
     from scilab_rl.analysis.groups import Group
 
 _log = logging.getLogger(__name__)
+# Options that mean nothing for the other kind of comparison.
+_OF_RUNS, _OF_CHOICES = ("metric", "score", "threshold", "parquet"), ("episodes", "softmax", "seed")
 
 
 def main(arguments: list[str]) -> int:
@@ -104,4 +107,13 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     )
     add_options(parser)
     compare_behavior.add_options(parser)
-    return parser.parse_args(arguments)
+    options = parser.parse_args(arguments)
+    is_of_choices = any(map(names_choices, options.groups))
+    foreign = _OF_RUNS if is_of_choices else _OF_CHOICES
+    given = [name for name in foreign if getattr(options, name) != parser.get_default(name)]
+    if given:
+        raise ConfigError(
+            f"--{given[0]} is for comparisons of {'runs' if is_of_choices else 'choices'}, and "
+            f"these are {'choices' if is_of_choices else 'runs'}; leave it out."
+        )
+    return options

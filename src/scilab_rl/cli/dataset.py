@@ -27,7 +27,7 @@ def main(arguments: list[str]) -> int:
     agent = options.agent or f"agent:{options.env.rpartition(':')[2].partition('-')[0]}"
     for kind in options.kinds:
         settings = DatasetSettings(
-            cfg, kind, agent, options.episodes, options.random_share, options.seed, options.licence
+            cfg, kind, agent, options.episodes, options.random_share, options.seed, options.license
         )
         folder, success = write_dataset(settings)
         _log.info("%s: %d episodes, success %s", folder, options.episodes, success)
@@ -50,7 +50,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     add("--episodes", type=positive, default=1000, help="of each set; default: 1000")
     add("--random-share", type=float, default=0.5, help="of medium's actions; default: 0.5")
     add("--seed", type=int, default=0, help="of the episodes; default: 0")
-    add("--licence", default="MIT", help="default: MIT, as Scilab-RL")
+    add("--license", default="MIT", help="default: MIT, as Scilab-RL")
     options = parser.parse_args(arguments)
     options.kinds = options.kinds or list(KINDS)
     for kind in options.kinds:

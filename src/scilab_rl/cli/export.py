@@ -62,7 +62,7 @@ def _agent(run: RunDirectory, options: argparse.Namespace) -> int:
         options.agent,
         options.output or PROJECT_AGENTS,
         n_episodes=options.episodes or 1000,
-        licence=options.licence,
+        license=options.license,
     )
     _log.info("%s\n%s", (folder / PAGE_FILE).read_text(encoding="utf-8"), folder)
     return 0
@@ -182,7 +182,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     add("--dimensions", type=positive, default=12, help="most numbers of an observation's parts")
     add("--seed", type=int, default=0, help="default: the run's seed plus 1")
     add("--format", choices=("csv", "parquet"), default="csv")
-    add("--licence", default="MIT", help="of an agent; default: MIT, as Scilab-RL")
+    add("--license", default="MIT", help="of an agent; default: MIT, as Scilab-RL")
     add(
         "--output",
         type=Path,

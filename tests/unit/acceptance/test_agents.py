@@ -44,7 +44,7 @@ def files_of(folder):
 
 def test_the_card_says_what_was_measured(agent, run):
     card = read_card(agent)
-    assert card["agent"] == "Tiny" and card["licence"] == "MIT"
+    assert card["agent"] == "Tiny" and card["license"] == "MIT"
     assert card["env"].endswith("TinyReach-v0") and card["algorithm"] == "cleansac"
     training = card["training"]
     assert training["steps"] == 120 and training["seed"] == 3
@@ -143,11 +143,11 @@ def test_an_agent_that_cannot_be_measured_leaves_the_old_one(agent, run, monkeyp
     before = files_of(agent)
     monkeypatch.setattr("scilab_rl.acceptance.agents.measure", lambda *_: 1 / 0)
     with pytest.raises(ZeroDivisionError):
-        write_agent(run, run / "rl_model_best", "Tiny", agent.parent, n_episodes=5, licence="MIT")
+        write_agent(run, run / "rl_model_best", "Tiny", agent.parent, n_episodes=5, license="MIT")
     assert files_of(agent) == before and len(list(agent.parent.iterdir())) == 1
 
 
 def test_a_run_without_an_evaluation_is_refused(run, tmp_path):
     (run / "metrics.jsonl").unlink()
     with pytest.raises(ConfigError, match="no evaluation yet"):
-        write_agent(run, run / "rl_model_best", "A", tmp_path, n_episodes=5, licence="MIT")
+        write_agent(run, run / "rl_model_best", "A", tmp_path, n_episodes=5, license="MIT")

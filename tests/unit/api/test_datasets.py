@@ -39,7 +39,7 @@ def test_one_command_writes_all_sets_of_a_task(
             successes += bool(episode.infos["success"][-1])
         env.close()
         assert f"success | {successes / 3:.3g}"[:12] in page
-        assert "| fingerprint | `" in page and "| licence | MIT |" in page and "mujoco==" in page
+        assert "| fingerprint | `" in page and "| license | MIT |" in page and "mujoco==" in page
         actions[kind] = np.concatenate([episode.actions for episode in data])
     # The script goes straight to the goal: 5 cm per step and unit.
     first = next(iter(minari.load_dataset("FetchReach/scripted-v0")))

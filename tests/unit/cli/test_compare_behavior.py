@@ -82,6 +82,8 @@ def test_without_people_a_model_has_the_parameters_of_its_yaml(compared):
         (("people.csv", "model:hybrid"), "use model=rescorlawagner"),
         (("people.csv", "agent:nobody"), "nobody"),
         (("people.csv", "agent:Reach1DOF"), "env=Reach1DOF-v0 is not a choice task"),
+        (("people.csv", "model:hybrid", "--metric", "x"), "--metric is for comparisons of runs"),
+        (("rescorlawagner", "sac", "--softmax", "2"), "--softmax is for comparisons of choices"),
     ],
 )
 def test_what_cannot_be_compared_is_named(project, words, message):

@@ -294,7 +294,7 @@ def fit_page(results: FitResults, title: str) -> str:
         f"{panel.n_actions} responses.",
         models=_table(MODEL_COLUMNS, model_rows(results)),
         models_caption="Smaller AIC and BIC, and larger probabilities of held-out choices, are "
-        "better. LOO P: probability of a choice given all others, from the hierarchical samples; "
+        "better. LOO P, with hierarchical=true: probability of a choice given all others; "
         "it is unreliable for choices with a bad Pareto k. Frequency: estimated share of "
         "participants with the model. PXP: protected exceedance probability, that it is the most "
         "frequent one (Rigoux et al., 2014).",
@@ -376,4 +376,6 @@ def recovery_page(recovery: Recovery) -> str:
 
 
 def _table(columns: Sequence[str], rows: Sequence[Row]) -> tuple[Sequence[str], list[list[object]]]:
-    return columns, [[row.get(name) for name in columns] for row in rows]
+    """Return the columns that any row has, and the rows."""
+    known = [name for name in columns if any(name in row for row in rows)]
+    return known, [[row.get(name) for name in known] for row in rows]
