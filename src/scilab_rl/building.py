@@ -129,7 +129,7 @@ def _first_update(cls: Callable[..., Algorithm], arguments: Mapping[str, Any], e
     wanted = int(arguments.get("learning_starts", default))
     needed = longest * env.num_envs + env.num_envs
     if wanted < needed:
-        # Nobody asked for the default; who chose another value is told.
+        # A default is raised silently, a value that somebody chose is not.
         _log.log(
             logging.DEBUG if wanted == default else logging.INFO,
             "learning_starts raised from %d to %d: hindsight replay needs one whole episode first.",

@@ -86,7 +86,7 @@ class JAXCRL(JaxOffPolicyAlgorithm):
         learning_rate: Of actor, encoders and temperature.
         buffer_size: Transitions that the replay buffer holds.
         learning_starts: Environment steps with random actions before the first update.
-        batch_size: Steps per update; each goal is told from those of all others.
+        batch_size: Steps per update; each goal is distinguished from those of all others.
         gamma: How far goals are in the future: 1 / (1 - gamma) steps on average.
         train_freq: Steps of each environment between rounds of updates.
         gradient_steps: Updates per round; -1: as many as steps were collected.
@@ -289,7 +289,7 @@ def critic_loss(encoders: Encoders, settings: Settings, batch: Batch) -> tuple[A
 
 
 def contrastive_loss(logits: Array, kind: str, logsumexp_penalty: float) -> Array:
-    """Return how badly each step is told its own goal.
+    """Return how badly each step is matched with its own goal.
 
     Args:
         logits: L_ij = f(s_i, a_i, g_j). Shapes: ``(batch, batch)``.

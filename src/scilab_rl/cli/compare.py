@@ -109,8 +109,8 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     compare_behavior.add_options(parser)
     options = parser.parse_args(arguments)
     is_of_choices = any(map(names_choices, options.groups))
-    foreign = _OF_RUNS if is_of_choices else _OF_CHOICES
-    given = [name for name in foreign if getattr(options, name) != parser.get_default(name)]
+    misplaced = _OF_RUNS if is_of_choices else _OF_CHOICES
+    given = [name for name in misplaced if getattr(options, name) != parser.get_default(name)]
     if given:
         raise ConfigError(
             f"--{given[0]} is for comparisons of {'runs' if is_of_choices else 'choices'}, and "

@@ -37,7 +37,7 @@ COMMANDS = {
     "goals": "map where in its goal space an agent fails, and what it expects",
     "human": "let a person play a task in a browser, and keep each choice",
     "fit": "fit cognitive models to choices and compare them",
-    "recover": "simulate and fit: are parameters and models told apart?",
+    "recover": "simulate and fit: can parameters and models be identified?",
     "export": "write observations, actions and metrics of an agent as a table",
     "dataset": "write expert, medium, scripted and random data sets of a task",
     "mlflow": "browse the learning curves of all runs with MLflow",

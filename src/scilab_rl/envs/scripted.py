@@ -44,7 +44,7 @@ class Push(Controller):
     """Goes behind an object, and pushes it towards the goal."""
 
     behind = 0.08  # m
-    width = 0.02  # m, how far beside the line of the push the gripper may be
+    width = 0.02  # m, how far from the line of the push the gripper may be
 
     def act(self, observation: Any) -> np.ndarray:
         """Return the action."""

@@ -11,7 +11,7 @@ place of the desired goal.
   episode. Its reward is 0 within ``threshold`` of that, and -1 elsewhere.
 * While exploring, an effector that is far from the object follows the first goal now and then.
 
-What differs from the paper: the two goals share one place in the vector, told apart by the flag,
+What differs from the paper: the two goals share one place in the vector, distinguished by the flag,
 instead of having masked places of their own. Where the task's goal is longer (the places of several
 blocks), the first goal takes its first numbers, and the others are 0. The task's reward is not
 changed.

@@ -167,7 +167,7 @@ def _start_ray() -> ModuleType:
     import ray
 
     ray.init(
-        address="local",  # also beside a cluster that somebody has started on this machine
+        address="local",  # even where a cluster already runs on this machine
         include_dashboard=False,
         log_to_driver=False,
         logging_level=logging.ERROR,

@@ -1,7 +1,7 @@
 """Intrinsic curiosity module (ICM): rewarded for consequences that could not be predicted.
 
 Pathak et al., 2017, "Curiosity-driven Exploration by Self-supervised Prediction", arXiv 1705.05363.
-Features phi of the state are learned so that the action can be told from them, and so leave out
+Features phi of the state are learned so that the action can be inferred from them, and so leave out
 what the agent has no influence on:
 
     inverse model   a^ = g(phi(s), phi(s')),      L_I = error of a^                     (eq. 2, 3)
