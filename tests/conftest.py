@@ -1,5 +1,6 @@
 """What holds for all tests."""
 
+import contextlib
 import logging
 import os
 import signal
@@ -21,11 +22,24 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 pytest.register_assert_rewrite("scilab_rl.testing.algorithms")
 
 
-@pytest.fixture(autouse=True)
-def _messages_as_before() -> Iterator[None]:
-    """The command line sets up the package's messages; the next test must not see that."""
+@contextlib.contextmanager
+def messages_as_before() -> Iterator[None]:
+    """The command line sets up the package's messages; what follows must not see that."""
     logger = logging.getLogger("scilab_rl")
     handlers, level, propagate = list(logger.handlers), logger.level, logger.propagate
     yield
     logger.handlers[:], logger.propagate = handlers, propagate
     logger.setLevel(level)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _messages_before_module() -> Iterator[None]:
+    """Fixtures of a module may use the command line, too."""
+    with messages_as_before():
+        yield
+
+
+@pytest.fixture(autouse=True)
+def _messages_before_test(_messages_before_module: None) -> Iterator[None]:
+    with messages_as_before():
+        yield

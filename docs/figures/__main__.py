@@ -159,7 +159,7 @@ def figure_seeds() -> None:
 
 def figure_pictures() -> None:
     """What `GoalEnv` draws of one, two and three numbers, and the example of the page."""
-    page = (IMAGES.parent / "howto" / "draw_environment.md").read_text(encoding="utf-8")
+    page = (Path(__file__).parents[1] / "howto" / "draw_environment.md").read_text(encoding="utf-8")
     example = re.search(r"```python title=\"src/custom_envs/open_field.py\"\n(.*?)```", page, re.S)
     assert example is not None
     names: dict[str, Any] = {}
