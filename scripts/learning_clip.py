@@ -12,6 +12,7 @@ import argparse
 import sys
 from pathlib import Path
 
+from scilab_rl.files import shown
 from scilab_rl.recording.movie import write_side_by_side
 from scilab_rl.recording.records import FOLDER, Clip, load_clip
 from scilab_rl.run.directory import find_run
@@ -34,7 +35,7 @@ def main() -> int:
     clips = [load_clip(path) for path in chosen]
     path = folder / "learning.mp4"
     write_side_by_side(clips, [title_of(clip) for clip in clips], options.metric, path)
-    sys.stdout.write(f"before, during and after learning: {path}\n")
+    sys.stdout.write(f"before, during and after learning: {shown(path)}\n")
     return 0
 
 

@@ -361,6 +361,8 @@ class PanelSheet:
         image = Image.fromarray(pixels)
         draw = ImageDraw.Draw(image)
         for panel in self.panels:
+            if panel.top == _TITLE:
+                self._name_events(draw, panel, index)
             self._draw_cursor(draw, panel, index)
         return image
 
@@ -422,18 +424,22 @@ class PanelSheet:
         draw.line([*corner, big(panel.right, panel.bottom)], fill=FRAME, width=_SMOOTH)
 
     def _draw_events(self, draw: ImageDraw, panel: _Panel) -> None:
-        """Draw a line at each event through all panels; those on top name it."""
-        free = 0.0  # from where on no name stands
+        """Draw a line at each event."""
         for index, event in self.events:
-            x, color = self._x(panel, index), event_color(event)
+            x = self._x(panel, index)
             ends = [_big(x, panel.top), _big(x, panel.bottom)]
-            draw.line(ends, fill=_faded(color), width=_SMOOTH)
-            letters = font(10 * _SMOOTH)
-            width = draw.textlength(event, letters) / _SMOOTH
+            draw.line(ends, fill=_faded(event_color(event)), width=_SMOOTH)
+
+    def _name_events(self, draw: ImageDraw, panel: _Panel, until: int) -> None:
+        """Write the names of events, each from its scene on; those without room are left out."""
+        letters, free = font(10), 0.0  # from where on nothing is written
+        for index, event in self.events:
+            x, width = self._x(panel, index), letters.getlength(event)
             left = x + 3 if x + 3 + width <= panel.right else x - 3 - width
-            if panel.top == _TITLE and left >= free:
+            if index <= until and left >= free:
                 free = left + width + 3
-                draw.text(_big(left, panel.top + 2), event, fill=color, font=letters, anchor="lt")
+                where = (left, panel.top + 2)
+                draw.text(where, event, fill=event_color(event), font=letters, anchor="lt")
 
     def _draw_curves(self, draw: ImageDraw, panel: _Panel) -> None:
         for number, curve in enumerate(panel.curves.values()):

@@ -125,6 +125,23 @@ def test_curves_are_drawn_only_up_to_the_scene() -> None:
     assert after == (0, 0, 0)
 
 
+def test_the_name_of_an_event_is_written_from_its_scene_on() -> None:
+    clip = make_clip(("reward",), n_steps=40)
+    for record in clip.records:
+        record.events = ["success"] if record.step in (38, 39) else []
+    frames = MovieFrames(clip)
+    top = np.s_[: frames.sheet.panels[0].top + 14, :-60]  # left of the event, high up
+
+    def n_green(index: int) -> int:
+        r, g, b = np.asarray(frames.sheet.until(index))[top].astype(int).transpose(2, 0, 1)
+        return int(((g - r > 60) & (g - b > 20)).sum())
+
+    counts = [n_green(index) for index in (30, 37, 38, 39)]
+    assert counts[:2] == [0, 0]
+    assert counts[2] > 5
+    assert counts[3] == counts[2]  # the second name would cover the first
+
+
 def test_ranges_are_those_of_the_whole_clip() -> None:
     assert value_range([[0.0, 10.0], [None, -10.0]]) == pytest.approx((-11.2, 11.2))
     assert value_range([[5.0, 5.001]]) == pytest.approx((0.0, 6.25125))
